@@ -1,0 +1,30 @@
+from importlib.metadata import version as _version
+
+from ._audit import Audit as Audit
+from ._discrete import (
+    AbstractDerivative as AbstractDerivative,
+    Gonzalez as Gonzalez,
+    MeanValue as MeanValue,
+)
+from ._initial import (
+    consistent_start as consistent_start,
+    ConsistentStart as ConsistentStart,
+    initial_state as initial_state,
+)
+from ._newton import Newton as Newton
+from ._results import RESULTS as RESULTS
+from ._schemes import (
+    AbstractScheme as AbstractScheme,
+    Composed as Composed,
+    EnergyConsistent as EnergyConsistent,
+    EnergyDecaying as EnergyDecaying,
+    EnergyPreserving as EnergyPreserving,
+    KappaDecaying as KappaDecaying,
+)
+from ._simulate import simulate as simulate
+from ._solution import Solution as Solution, Statistics as Statistics
+from ._step import step as step, StepOutput as StepOutput, Warm as Warm
+from ._system import State as State, System as System
+
+
+__version__ = _version("enerjax")

@@ -1,0 +1,46 @@
+"""Energies and constraint residuals along a run, to judge it by."""
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, Float
+
+from ._model import Model
+from ._system import State
+
+
+class Audit(eqx.Module):
+    """What a run did to the energy and to the constraints, at each saved time.
+
+    - `kinetic`, `potential`, `energy`: shape `(times,)` (energy).
+    - `dissipated`: shape `(times,)`, the energy that the scheme removed since the row
+      before, by its own identity; 0 in row 0. `energy[k] = energy[k-1] - dissipated[k]`
+      up to round-off and what Newton left.
+    - `constraint`: shape `(times, nc)`, residuals of the constraints, joints first, in
+      their own units.
+    - `constraint_rate`: shape `(times, nj)`, residuals of the joints at velocity level.
+    """
+
+    kinetic: Float[Array, " times"]
+    potential: Float[Array, " times"]
+    dissipated: Float[Array, " times"]
+    constraint: Float[Array, "times nc"]
+    constraint_rate: Float[Array, "times nj"]
+
+    @property
+    def energy(self) -> Float[Array, " times"]:
+        return self.kinetic + self.potential
+
+
+def audit(model: Model, states: State, dissipated: Float[Array, " times"]) -> Audit:
+    """The audit of states with a leading time axis."""
+
+    def at(state: State):
+        return (
+            model.kinetic(state.v),
+            model.potential(state.q),
+            model.constraint(state.q),
+            model.joint_rate(state.q, state.v),
+        )
+
+    kinetic, potential, constraint, rate = jax.vmap(at)(states)
+    return Audit(kinetic, potential, dissipated, constraint, rate)

@@ -1,0 +1,25 @@
+import abc
+from collections.abc import Callable
+
+import equinox as eqx
+
+from .._types import Coordinates, Scalar
+
+
+class AbstractDerivative(eqx.Module):
+    """A discrete gradient: a rule that turns a function and two points into a vector.
+
+    Every form satisfies, with `D = gradient(fn, a, b)`,
+
+        D . (b - a) = fn(b) - fn(a)     (directionality, to round-off)
+        D -> grad fn(a)   as b -> a     (consistency)
+
+    is symmetric in `a` and `b`, and linear in `fn`: the discrete gradient of
+    `V + lam . Phi` is that of `V` plus those of the constraints, row by row.
+    """
+
+    @abc.abstractmethod
+    def gradient(
+        self, fn: Callable[[Coordinates], Scalar], a: Coordinates, b: Coordinates
+    ) -> Coordinates:
+        """The discrete gradient of the scalar function `fn` between `a` and `b`."""

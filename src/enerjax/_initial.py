@@ -1,0 +1,164 @@
+"""Consistent starts: positions, velocities, accelerations and multipliers."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from ._check import check_system, is_known
+from ._model import Model
+from ._newton import find_root, Newton
+from ._results import from_root_finder, RESULTS
+from ._system import State, System
+from ._types import Args, Coordinates, Flag, Multipliers, Velocities
+
+
+class ConsistentStart(eqx.Module):
+    """A start that satisfies the constraints, and what had to be done for it.
+
+    - `state`: the projected `State`.
+    - `accelerations`: `vdot`, shape `(nv,)`.
+    - `multipliers`: `lambda`, shape `(nc,)`, joints first (energy per constraint unit).
+    - `constraint_before`, `constraint_after`: residuals at position level, `(nc,)`.
+    - `rate_before`, `rate_after`: residuals of the joints at velocity level, `(nj,)`;
+      before the projection of `v`, but after that of `q`.
+    """
+
+    state: State
+    accelerations: Velocities
+    multipliers: Multipliers
+    constraint_before: Multipliers
+    constraint_after: Multipliers
+    rate_before: Float[Array, " nj"]
+    rate_after: Float[Array, " nj"]
+
+
+def initial_state(
+    system: System, q: ArrayLike, v: ArrayLike, args: Args = None
+) -> State:
+    """The `State` nearest to `(q, v)` that satisfies the constraints.
+
+    As `consistent_start`, of which it returns the state alone.
+    """
+    return consistent_start(system, q, v, args).state
+
+
+def consistent_start(
+    system: System, q: ArrayLike, v: ArrayLike, args: Args = None
+) -> ConsistentStart:
+    """Projects a start onto the constraints and solves for what is in balance there.
+
+    `q` moves by the smallest change in the metric of the inertia (Euclidean along
+    redundant coordinates) to `Phi(q) = 0`, then `v` by the smallest change in the inertia
+    to `dPhi/dt = 0`; accelerations and multipliers follow from the equations of motion.
+    All are differentiable with respect to `q`, `v` and `args`, so derivatives of a run
+    with respect to its start move along the constraints.
+
+    **Arguments:**
+
+    - `system`: a `System`.
+    - `q`, `v`: arrays or lists, `(nq,)` and `(nv,)`, close to the constraints: close
+      enough for the linearised constraints to explain the error in `q`. (In numbers: a
+      second correction must be less than a quarter of the first.)
+    - `args`: handed to the functions of the system.
+
+    **Returns:** a `ConsistentStart`.
+
+    **Raises:** `ValueError` for a start that is too far away, with the residual, and for
+    bad input as `simulate`. Under `jit`, `vmap` and `grad` a start too far away raises
+    `equinox.EquinoxRuntimeError` at run time.
+    """
+    state, args = check_system(system, State(q, v), args)
+    start, repairable, result = _project(system, state, args)
+    bad = ~repairable | (result != RESULTS.successful)
+    message = (
+        "The start is too far from the constraints to be repaired: their linearisation "
+        "does not explain the error, so the nearest admissible configuration may not be "
+        "the one that was meant. Check the start against lengths and anchors in `args`; "
+        "constraints that repeat each other fail in the same way."
+    )
+    if not is_known((bad, start)):
+        return eqx.error_if(start, bad, message)
+    if bad:
+        raise ValueError(
+            f"{message} Residual of the constraints: {start.constraint_before}."
+        )
+    return start
+
+
+@eqx.filter_jit
+def _project(
+    system: System, guess: State, args: Args
+) -> tuple[ConsistentStart, Flag, RESULTS]:
+    model = Model(system, guess, args)
+    before = model.constraint(guess.q)
+    q, repairable, result = _project_position(model, guess.q)
+    v = _project_velocity(model, q, guess.v)
+    state = State(q, v)
+    acceleration, multipliers = model.accelerations(state)
+    start = ConsistentStart(
+        state,
+        acceleration,
+        multipliers,
+        before,
+        model.constraint(q),
+        model.joint_rate(q, guess.v),
+        model.joint_rate(q, v),
+    )
+    finite = jnp.all(jnp.isfinite(acceleration)) & jnp.all(jnp.isfinite(multipliers))
+    return start, repairable & finite, result
+
+
+def _project_position(
+    model: Model, guess: Coordinates
+) -> tuple[Coordinates, Flag, RESULTS]:
+    if model.constraint(guess).size == 0:
+        return guess, jnp.array(True), RESULTS.successful
+    metric, scales = model.metric(guess), model.scales(guess)
+    size = jnp.max(jnp.abs(guess) * scales.coordinate)
+    size = jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
+
+    def conditions(x, inputs):
+        """The nearest point: `metric (q - guess) + B^T mu = 0`, `Phi(q) = 0`."""
+        model, metric, guess = inputs
+        shift, mu = size * x[0] / scales.coordinate, size * x[1] / scales.constraint
+        constraint, pull = jax.vjp(model.constraint, guess + shift)
+        force = metric @ shift + pull(mu)[0]
+        rows = size * scales.constraint + scales.constraint_size
+        return force / (size * scales.coordinate), constraint / rows
+
+    zero = (jnp.zeros_like(guess), jnp.zeros_like(scales.constraint))
+    x, _, result = find_root(
+        conditions, Newton(), zero, (model, metric, guess), max_iterations=50
+    )
+    shift = size * x[0] / scales.coordinate
+    return guess + shift, _linear(model, metric, guess), from_root_finder(result)
+
+
+def _linear(model: Model, metric: Float[Array, "nq nq"], q: Coordinates) -> Flag:
+    """Whether the linearised constraints explain the error at `q`.
+
+    The natural monotonicity test of P. Deuflhard, Newton Methods for Nonlinear Problems
+    (2004): a simplified second correction shorter than a quarter of the first.
+    """
+    jacobian = model.constraint_jacobian(q)
+    flexible = jnp.linalg.solve(metric, jacobian.T)
+
+    def correction(residual):
+        return flexible @ jnp.linalg.solve(jacobian @ flexible, residual)
+
+    first = correction(model.constraint(q))
+    second = correction(model.constraint(q - first))
+    length = lambda x: jnp.sqrt(x @ metric @ x)
+    # Nothing to explain where the error is round-off.
+    tiny = 1e3 * jnp.finfo(q.dtype).eps * (1e-3 + length(q))
+    return (length(second) <= 0.25 * length(first)) | (length(first) <= tiny)
+
+
+def _project_velocity(model: Model, q: Coordinates, v: Velocities) -> Velocities:
+    rate = model.joint_rate(q, v)
+    if rate.size == 0:
+        return v
+    jacobian = jax.jacfwd(model.joint_rate, argnums=1)(q, v)
+    flexible = model.inverse_inertia @ jacobian.T
+    return v - flexible @ jnp.linalg.solve(jacobian @ flexible, rate)

@@ -1,0 +1,175 @@
+"""The one nonlinear driver: every step equation of the package is solved here.
+
+It knows no mechanics. It takes a function whose arguments and values are scaled to
+order one, and finds its root with an optimistix root finder, by default `Newton`.
+Derivatives of the root follow from the implicit function theorem, in forward and in
+reverse mode.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PyTree
+
+from ._types import Count, Flag, Scalar
+
+
+class _Iterate(eqx.Module):
+    """What Newton carries from one iteration to the next."""
+
+    residual: PyTree[Array]
+    correction: Scalar  # size of the last correction
+    done: Flag
+
+
+def max_norm(x: PyTree[Array]) -> Scalar:
+    """The largest entry; for all residuals and corrections here are of order one."""
+    return jnp.max(jnp.abs(ravel_pytree(x)[0]), initial=0.0)
+
+
+class Newton(optx.AbstractRootFinder):
+    """Newton's method on a problem scaled to order one, down to round-off.
+
+    Stops when the residual is round-off, or when the corrections shrink so fast that
+    the error left, predicted from their quadratic convergence, is: with corrections
+    `c_k` the next one is about `c_k (c_k / c_{k-1})^2`. Neither test spends a Jacobian,
+    and the second does not demand a residual below what `fn` can resolve.
+
+    **Arguments:**
+
+    - `rtol`: bound on the predicted error, in units of round-off of the dtype.
+    - `atol`: bound on the residual, in the same units.
+    """
+
+    rtol: float = 8.0
+    atol: float = 8.0
+
+    @property
+    def norm(self) -> Callable[[PyTree[Array]], Scalar]:  # pyright: ignore
+        return max_norm
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        del f_struct, aux_struct, tags
+        residual, _ = fn(y, args)
+        done = self._small(residual) | options.get("skip", False)
+        unknown = jnp.asarray(jnp.inf, ravel_pytree(residual)[0].dtype)
+        return _Iterate(residual, unknown, done)
+
+    def step(self, fn, y, args, options, state, tags):
+        del options, tags
+        flat, unravel = ravel_pytree(y)
+        value, _ = ravel_pytree(state.residual)
+        flat_fn = lambda x: ravel_pytree(fn(unravel(x), args)[0])[0]
+        correction = jnp.linalg.solve(jax.jacfwd(flat_fn)(flat), value)
+        new_y = unravel(flat - correction)
+        residual, aux = fn(new_y, args)
+        size = max_norm(correction)
+        eps = jnp.finfo(size.dtype).eps
+        contraction = size / state.correction
+        predicted = size * contraction**2
+        # Without a second correction nothing is known of the curvature; its size must do.
+        predicted = jnp.where(jnp.isinf(state.correction), 1e2 * size**2, predicted)
+        quadratic = (contraction < 0.1) & (predicted <= self.rtol * eps)
+        done = self._small(residual) | quadratic
+        return new_y, _Iterate(residual, size, done), aux
+
+    def terminate(self, fn, y, args, options, state, tags):
+        del fn, y, args, options, tags
+        return state.done, optx.RESULTS.successful
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        del fn, args, options, tags, result
+        return y, aux, {}
+
+    def _small(self, residual: PyTree[Array]) -> Flag:
+        size = max_norm(residual)
+        return size <= self.atol * jnp.finfo(size.dtype).eps
+
+
+def _while_loop(cond_fun, body_fun, init, max_steps):
+    """The loop that optimistix runs, without its own differentiation rules."""
+
+    def cond(carry):
+        count, state = carry
+        return cond_fun(state) & (count < max_steps)
+
+    def body(carry):
+        count, state = carry
+        return count + 1, body_fun(state)
+
+    return jax.lax.while_loop(cond, body, (jnp.array(0), init))[1]
+
+
+@eqx.filter_custom_jvp
+def _root(primal_fn, rewrite_fn, inputs):
+    del rewrite_fn
+    root, rest = primal_fn((*inputs, _while_loop))
+    return root, rest
+
+
+@_root.def_jvp
+def _root_jvp(primals, tangents):
+    primal_fn, rewrite_fn, inputs = primals
+    _, _, t_inputs = tangents
+    root, rest = _root(primal_fn, rewrite_fn, inputs)
+    is_none = lambda x: x is None
+    unmoved = jax.tree.map(is_none, t_inputs, is_leaf=is_none)
+    fixed, moved = eqx.partition(inputs, unmoved, is_leaf=is_none)
+    flat, unravel = ravel_pytree(root)
+
+    def flat_fn(x, moved):
+        value = rewrite_fn(unravel(x), rest, eqx.combine(moved, fixed))
+        return ravel_pytree(value)[0]
+
+    _, rate = jax.jvp(lambda moved: flat_fn(flat, moved), (moved,), (t_inputs,))
+    jacobian = jax.jacfwd(lambda x: flat_fn(x, eqx.combine(moved, fixed)))(flat)
+    t_root = unravel(-jnp.linalg.solve(jacobian, rate))
+    dynamic, _ = eqx.partition(rest, eqx.is_inexact_array)
+    t_rest = jax.tree.map(jnp.zeros_like, dynamic)
+    return (root, rest), (t_root, t_rest)
+
+
+class ImplicitFunction(optx.AbstractAdjoint):
+    """The implicit function theorem, with one dense linear solve for each derivative.
+
+    Unlike `optx.ImplicitAdjoint` it raises nothing from inside the compiled program: a
+    singular lane of a batch gives non-finite derivatives of its own and leaves the
+    others alone.
+    """
+
+    def apply(self, primal_fn, rewrite_fn, inputs, tags):
+        del tags
+        return _root(primal_fn, rewrite_fn, inputs)
+
+
+def find_root(
+    fn: Callable[[PyTree[Array], Any], PyTree[Array]],
+    root_finder: optx.AbstractRootFinder,
+    guess: PyTree[Array],
+    args: PyTree,
+    *,
+    max_iterations: int,
+    skip: Flag | bool = False,
+) -> tuple[PyTree[Array], Count, optx.RESULTS]:
+    """The root of `fn(y, args)`, the iterations spent, and how they ended.
+
+    Never raises. With `skip`, `Newton` returns the guess without an iteration.
+    """
+    solution = optx.root_find(
+        fn,
+        root_finder,
+        guess,
+        args,
+        options={"skip": skip},
+        max_steps=max_iterations,
+        adjoint=ImplicitFunction(),
+        throw=False,
+    )
+    return solution.value, solution.stats["num_steps"], solution.result
+
+

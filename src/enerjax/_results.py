@@ -1,0 +1,44 @@
+"""How a step can end. Failures are values: each step of each lane carries one."""
+
+import equinox as eqx
+import optimistix as optx
+
+
+class RESULTS(eqx.Enumeration):
+    """The outcome of a step or of a run; the message says what to do about it."""
+
+    successful = ""
+    not_converged = (
+        "Newton's method did not converge. The step may be too long for the motion: "
+        "reduce `h`. Light masses between heavy ones or stiff springs want "
+        "`EnergyConsistent(1.0)` or `EnergyDecaying(1.0)`, which damp what the step "
+        "cannot resolve."
+    )
+    nonfinite = (
+        "The step equations became singular or non-finite. Constraints may be redundant "
+        "or the pose singular, a function of the system may be undefined there (a "
+        "division by zero, a root of a negative number), or `h` is far too long."
+    )
+    inconsistent_start = (
+        "The start does not satisfy the constraints that this scheme holds. Make it "
+        "with `initial_state(system, q, v, args)`, which projects it onto them."
+    )
+    kappa_out_of_range = (
+        "kappa left (0, 2): the kinetic energy hardly changed in this step, and kappa is "
+        "defined by a division by that change, so that nothing bounds the energy any "
+        "more. This is a limit of the scheme, not of the step: use `EnergyDecaying` or "
+        "`EnergyConsistent`."
+    )
+
+
+def first_failure(old: RESULTS, new: RESULTS) -> RESULTS:
+    """`old` unless it is a success."""
+    return RESULTS.where(old == RESULTS.successful, new, old)
+
+
+def from_root_finder(result: optx.RESULTS) -> RESULTS:
+    """What an optimistix outcome means for a step."""
+    broken = (result == optx.RESULTS.nonfinite) | (result == optx.RESULTS.singular)
+    failure = RESULTS.where(broken, RESULTS.nonfinite, RESULTS.not_converged)
+    okay = result == optx.RESULTS.successful
+    return RESULTS.where(okay, RESULTS.successful, failure)

@@ -1,0 +1,149 @@
+import abc
+from typing import Any, Generic, Literal, TypeAlias, TypeVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import PyTree
+
+from .._discrete import AbstractDerivative
+from .._model import Model
+from .._results import RESULTS
+from .._segment import Increment, Segment
+from .._system import State
+from .._types import (
+    Coordinates,
+    JointMultipliers,
+    Multipliers,
+    Scalar,
+    Velocities,
+)
+
+
+# The levels at which joints are held: positions and velocities, stabilised as by Gear,
+# Gupta and Leimkuhler; or positions only.
+Formulation: TypeAlias = Literal["ggl", "index3"]
+Z = TypeVar("Z")
+
+
+class StepProblem(eqx.Module):
+    """Everything that is known when a step starts."""
+
+    model: Model
+    start: State
+    h: Scalar
+    derivative: AbstractDerivative
+    formulation: Formulation = eqx.field(static=True)
+
+    def segment(self, qa: Coordinates, qb: Coordinates) -> Segment:
+        return Segment(self.model, self.derivative, qa, qb)
+
+    def at(self, increment: Increment) -> Coordinates:
+        """The configuration that an increment leads to."""
+        return self.start.q + self.h * increment.rate
+
+    def joint_rate(self, q: Coordinates, v: Velocities) -> JointMultipliers:
+        """`psi(q, v)` where the formulation holds it, else no rows."""
+        if self.formulation == "index3":
+            return jnp.zeros((0,), q.dtype)
+        return self.model.joint_rate(q, v)
+
+    def rows(self, momentum: Coordinates, end: State) -> Increment:
+        """The rows of one node: balance of momentum, and the constraints held there."""
+        return Increment(
+            momentum,
+            self.model.constraint(end.q) / self.h,
+            self.joint_rate(end.q, end.v),
+        )
+
+    def guess(self, acceleration: Velocities, multipliers: Multipliers) -> Increment:
+        """The increment of a Taylor step of the whole length."""
+        q, v = self.start.q, self.start.v
+        rate = self.model.lift(q, v + 0.5 * self.h * acceleration)
+        num_rates = self.joint_rate(q, v).size
+        return Increment(rate, self.h * multipliers, jnp.zeros((num_rates,), q.dtype))
+
+
+class StepEnd(eqx.Module):
+    """What a solved step yields.
+
+    - `state`: at the end of the step.
+    - `multipliers`: `lambda` of the step, joints first (energy per constraint unit).
+    - `dissipated`: the energy that the scheme removed, by its own identity.
+    - `details`: what the scheme reports of its own, or `None`.
+    - `result`: a failure that the scheme itself can see.
+    """
+
+    state: State
+    multipliers: Multipliers
+    dissipated: Scalar
+    details: PyTree[Any]
+    result: RESULTS
+
+
+class AbstractScheme(eqx.Module):
+    """A one-step method: what `step` and `simulate` accept."""
+
+    @property
+    @abc.abstractmethod
+    def order(self) -> int:
+        """Order of accuracy in `q` and `v`, constrained or not."""
+
+    @property
+    @abc.abstractmethod
+    def stages(self) -> tuple[float, ...]:
+        """The lengths of the solves that make up a step, as parts of `h`."""
+
+    @property
+    @abc.abstractmethod
+    def stage(self) -> "AbstractSingleSolve":
+        """The scheme of each of these solves."""
+
+
+class AbstractSingleSolve(AbstractScheme, Generic[Z]):
+    """A scheme whose step is one nonlinear solve.
+
+    `Z` is a pytree of `Increment`s, one for each node of the step, and of the scheme's
+    own scalar unknowns, which must be dimensionless. `residual` returns the same
+    structure, with rows in the places of the unknowns.
+    """
+
+    formulation: eqx.AbstractVar[Formulation]
+
+    @property
+    def stages(self) -> tuple[float, ...]:
+        return (1.0,)
+
+    @property
+    def stage(self) -> "AbstractSingleSolve":
+        return self
+
+    @property
+    @abc.abstractmethod
+    def symmetric(self) -> bool:
+        """Whether a step of `-h` undoes a step of `h`: such a scheme can be composed."""
+
+    @abc.abstractmethod
+    def problem(self, model: Model, start: State, h: Scalar) -> StepProblem:
+        """The step's data. What is to stay fixed during the solve is computed here."""
+
+    @abc.abstractmethod
+    def predict(
+        self, problem: StepProblem, acceleration: Velocities, multipliers: Multipliers
+    ) -> Z:
+        """A first guess from the accelerations and multipliers at the start."""
+
+    @abc.abstractmethod
+    def residual(self, z: Z, problem: StepProblem) -> Z:
+        """The step equations; zero at the solution."""
+
+    @abc.abstractmethod
+    def finish(self, z: Z, problem: StepProblem) -> StepEnd:
+        """The end of the step from the solved unknowns."""
+
+
+def check_formulation(scheme: str, formulation: str) -> None:
+    if formulation not in ("ggl", "index3"):
+        raise ValueError(
+            f'`{scheme}(formulation={formulation!r})`: use "ggl" (joints held at position '
+            'and velocity level) or "index3" (position level only).'
+        )

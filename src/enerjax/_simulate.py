@@ -1,0 +1,179 @@
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+
+from ._audit import audit
+from ._check import is_known, prepare
+from ._model import Model
+from ._newton import Newton
+from ._results import first_failure, RESULTS
+from ._schemes import AbstractScheme
+from ._solution import Solution, Statistics
+from ._step import advance, first_warm, Warm
+from ._system import State, System
+from ._types import Args, Count, Flag, Real, Scalar
+
+
+class _Carry(eqx.Module):
+    """What one step hands to the next; the last good state once a step has failed."""
+
+    state: State
+    warm: Warm
+    result: RESULTS
+    completed: Count
+
+
+def simulate(
+    system: System,
+    scheme: AbstractScheme,
+    start: State,
+    args: Args = None,
+    *,
+    h: Real,
+    num_steps: int,
+    save_every: int = 1,
+    root_finder: optx.AbstractRootFinder = Newton(),
+    throw: bool = True,
+) -> Solution:
+    """Integrate `num_steps` steps of length `h` from `start`.
+
+    `h`, the numbers of the scheme (`alpha`), `start` and all inexact leaves of `args` are
+    traced: new values never recompile, and `vmap`, `grad`, `jvp` and `jit` work over each.
+    Write a number that you want to change as `1.0`, not `1`: Python integers are part
+    of the program. For derivatives with respect to the start, make the start inside the
+    differentiated function with `initial_state`, so that it stays on the constraints.
+
+    **Arguments:**
+
+    - `system`: what moves; see `System`.
+    - `scheme`: how; see the schemes. There is no default: it is part of the model.
+    - `start`: a `State` that satisfies the constraints, as `initial_state` makes it.
+    - `args`: any pytree, handed to the functions of the system.
+    - `h`: length of a step (time), positive.
+    - `num_steps`, `save_every`: every `save_every`-th state is saved, and the start. Their
+      quotient must be whole. In reverse mode the steps between two saves are computed
+      again instead of stored.
+    - `root_finder`: an optimistix root finder for the step equations, which are scaled
+      to order one (so tolerances are relative).
+    - `throw`: raise an error at the end of a run that failed, which names the step and
+      the cause. With `False` look at `result`: rows after the failure are NaN.
+
+    **Returns:** a `Solution`.
+
+    **Raises:** `ValueError` or `TypeError` for bad input, before any step;
+    `equinox.EquinoxRuntimeError` for a failed run if `throw`.
+    """
+    for name, count in (("num_steps", num_steps), ("save_every", save_every)):
+        if not isinstance(count, int) or isinstance(count, bool) or count < 1:
+            raise ValueError(f"`{name}` must be a positive integer, got {count!r}.")
+    if num_steps % save_every != 0:
+        raise ValueError(
+            f"`num_steps` ({num_steps}) must be a multiple of `save_every` ({save_every})."
+        )
+    start, args, h = prepare(system, scheme, start, args, h)
+    solution = _run(
+        system, scheme, start, args, h, root_finder, num_steps, save_every
+    )
+    return _raise_failure(solution, h) if throw else solution
+
+
+@eqx.filter_jit
+def _run(system, scheme, start, args, h, root_finder, num_steps, save_every):
+    model = Model(system, start, args)
+    acceleration, multipliers0 = model.accelerations(start)
+    warm = first_warm(scheme, model, start, h, acceleration, multipliers0)
+
+    def one_step(carry: _Carry, _):
+        skip = carry.result != RESULTS.successful
+        out = advance(scheme, model, carry.state, h, carry.warm, root_finder, skip)
+        result = first_failure(carry.result, out.result)
+        good = result == RESULTS.successful
+        state, memory = _select(
+            good, (out.state, out.warm), (carry.state, carry.warm)
+        )
+        completed = carry.completed + good.astype(carry.completed.dtype)
+        reported = (out.multipliers, out.details)
+        return _Carry(state, memory, result, completed), (
+            reported,
+            jnp.where(good, out.dissipated, 0),
+            jnp.where(skip, 0, out.newton_iterations),
+        )
+
+    def one_save(carry: _Carry, _):
+        carry, (reported, dissipated, iterations) = jax.lax.scan(
+            one_step, carry, None, length=save_every
+        )
+        last = jax.tree.map(lambda x: x[-1], reported)
+        row = (carry.state, *last, jnp.sum(dissipated))
+        good = carry.result == RESULTS.successful
+        return carry, (_nan_unless(good, row), iterations)
+
+    if save_every > 1:
+        one_save = jax.checkpoint(one_save)
+    begin = _Carry(start, warm, _check_start(scheme, model, start, h), jnp.array(0))
+    end, (rows, iterations) = jax.lax.scan(
+        one_save, begin, None, length=num_steps // save_every
+    )
+    states, multipliers, details, dissipated = rows
+    row0 = (start, multipliers0, jnp.zeros_like(h))
+    states, multipliers, dissipated = jax.tree.map(
+        lambda first, rest: jnp.concatenate([first[None], rest]),
+        row0,
+        (states, multipliers, dissipated),
+    )
+    times = h * jnp.arange(0, num_steps + 1, save_every, dtype=h.dtype)
+    return Solution(
+        times,
+        states,
+        multipliers,
+        details,
+        audit(model, states, dissipated),
+        Statistics(iterations.reshape(-1), end.completed),
+        end.result,
+    )
+
+
+def _select(good: Flag, new, old):
+    return jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)
+
+
+def _nan_unless(good: Flag, tree):
+    return jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), tree)
+
+
+def _check_start(
+    scheme: AbstractScheme, model: Model, start: State, h: Scalar
+) -> RESULTS:
+    """Whether the start satisfies what the scheme holds, to half the digits.
+
+    An error there would stay in the energy balance of the first step. The measure is
+    the motion or velocity that would repair it, against the sizes of the motion.
+    """
+    scales = model.scales(start.q)
+    root = jnp.sqrt(model.energy_scale(start, h))
+    # NaN compares false: a start that cannot be measured fails at its first step.
+    tolerance = jnp.sqrt(jnp.finfo(h.dtype).eps)
+    position = jnp.abs(model.constraint(start.q))
+    length = jnp.max(jnp.abs(start.q) * scales.coordinate) + h * root
+    far = position > 1e2 * tolerance * (length * scales.constraint + scales.constraint_size)
+    bad = jnp.any(far)
+    if scheme.stage.formulation == "ggl":
+        rate = jnp.abs(model.joint_rate(start.q, start.v))
+        fast = rate > 1e2 * tolerance * root * scales.constraint[: rate.size]
+        bad = bad | jnp.any(fast)
+    return RESULTS.where(bad, RESULTS.inconsistent_start, RESULTS.successful)
+
+
+def _raise_failure(solution: Solution, h: Scalar) -> Solution:
+    failed = solution.result != RESULTS.successful
+    if not is_known((failed, solution.stats.completed_steps, h)):
+        return solution.result.error_if(solution, failed)
+    if failed:
+        done = int(solution.stats.completed_steps)
+        raise eqx.EquinoxRuntimeError(
+            f"The run failed in step {done + 1}, from t = {done * float(h):.6g} to "
+            f"{(done + 1) * float(h):.6g}. {RESULTS[solution.result]} "
+            "(`throw=False` returns the run up to there.)"
+        )
+    return solution

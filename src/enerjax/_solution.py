@@ -1,0 +1,46 @@
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Array, Float, Int, PyTree
+
+from ._audit import Audit
+from ._results import RESULTS
+from ._system import State
+from ._types import Count
+
+
+class Statistics(eqx.Module):
+    """What a run cost.
+
+    - `newton_iterations`: of each step, shape `(num_steps,)`; 0 after a failure.
+    - `completed_steps`: number of steps before the first failure, or all.
+    """
+
+    newton_iterations: Int[Array, " steps"]
+    completed_steps: Count
+
+
+class Solution(eqx.Module):
+    """A run. Every array has a leading axis of saved times; row 0 is the start.
+
+    - `ts`: shape `(times,)`, counted from 0 (time).
+    - `ys`: a `State` with `q` of shape `(times, nq)` and `v` of shape `(times, nv)`.
+    - `multipliers`: shape `(times, nc)`, `lambda` of the step that ends at each row,
+      joints first; row 0 those of the consistent start. The force on the coordinates is
+      `-B^T lambda`.
+    - `details`: what the scheme reports of its own, for the steps that end at the rows
+      after the start (`KappaDecaying`: kappa, shape `(times - 1,)`), or `None`.
+    - `audit`: energies and constraint residuals.
+    - `stats`: `newton_iterations` and `completed_steps`.
+    - `result`: `RESULTS.successful`, or the first failure.
+
+    Rows after a failed step are NaN; those before it are what they would be without it.
+    """
+
+    ts: Float[Array, " times"]
+    ys: State
+    multipliers: Float[Array, "times nc"]
+    details: PyTree[Any]
+    audit: Audit
+    stats: Statistics
+    result: RESULTS

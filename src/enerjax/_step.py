@@ -1,0 +1,226 @@
+"""One step: predict, solve, finish; or a chain of such solves.
+
+This is the layer where solves are counted, and where the physics scales what Newton
+sees: rates by the inertia, multipliers by the gradients of their constraints, and
+everything by an energy of the step.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import PyTree
+
+from ._check import prepare
+from ._model import Model
+from ._newton import find_root, max_norm, Newton
+from ._results import first_failure, from_root_finder, RESULTS
+from ._schemes import AbstractScheme, AbstractSingleSolve
+from ._segment import Increment
+from ._system import State, System
+from ._types import Args, Count, Flag, Multipliers, Real, Scalar, Velocities
+
+
+# Enough for the linear convergence of a locking step; a step that needs more has failed.
+MAX_ITERATIONS = 50
+
+
+class Warm(eqx.Module):
+    """The unknowns of the last three steps, newest first, for each stage.
+
+    Pass it from one `step` to the next, with the same `h`, to start Newton closer.
+    """
+
+    unknowns: PyTree[Any]
+
+
+class StepOutput(eqx.Module):
+    """One step, done or failed.
+
+    - `state`: at the end of the step; meaningless if the step failed.
+    - `multipliers`: `lambda` of the step, `(nc,)`, joints first.
+    - `dissipated`: energy that the scheme removed, by its own identity.
+    - `details`: what the scheme reports of its own, or `None`.
+    - `newton_iterations`: over all solves of the step.
+    - `result`: a `RESULTS`; compare it with `RESULTS.successful`.
+    - `warm`: pass it to the next step.
+    """
+
+    state: State
+    multipliers: Multipliers
+    dissipated: Scalar
+    details: PyTree[Any]
+    newton_iterations: Count
+    result: RESULTS
+    warm: Warm
+
+
+def first_warm(
+    scheme: AbstractScheme,
+    model: Model,
+    start: State,
+    h: Scalar,
+    acceleration: Velocities,
+    multipliers: Multipliers,
+) -> Warm:
+    """The memory of a run that begins: every stage predicted from the start."""
+
+    def predict(length):
+        problem = scheme.stage.problem(model, start, length * h)
+        z = scheme.stage.predict(problem, acceleration, multipliers)
+        return jax.tree.map(lambda x: jnp.stack([x, x, x]), z)
+
+    lengths = jnp.asarray(scheme.stages, h.dtype)
+    return Warm(jax.vmap(predict)(lengths))
+
+
+def advance(
+    scheme: AbstractScheme,
+    model: Model,
+    start: State,
+    h: Scalar,
+    warm: Warm,
+    root_finder: optx.AbstractRootFinder,
+    skip: Flag,
+) -> StepOutput:
+    """One step of a scheme, without checks. With `skip` it costs no iteration."""
+
+    def stage(state, stage_input):
+        length, memory = stage_input
+        end, iterations, result, memory = _solve(
+            scheme.stage, model, state, length * h, memory, root_finder, skip
+        )
+        reported = (end.multipliers, end.dissipated, end.details, iterations, result)
+        return end.state, (length, reported, memory)
+
+    lengths = jnp.asarray(scheme.stages, h.dtype)
+    state, (lengths, reported, memory) = jax.lax.scan(
+        stage, start, (lengths, warm.unknowns)
+    )
+    multipliers, dissipated, details, iterations, results = reported
+    return StepOutput(
+        state,
+        # The mean force over the step: stages count by their length, backwards ones too.
+        lengths @ multipliers,
+        jnp.sum(dissipated),
+        jax.tree.map(lambda x: x[-1], details),
+        jnp.sum(iterations),
+        _first_of(results),
+        Warm(memory),
+    )
+
+
+@eqx.filter_jit
+def _single_step(system, scheme, state, args, h, warm, root_finder):
+    model = Model(system, state, args)
+    if warm is None:
+        warm = first_warm(scheme, model, state, h, *model.accelerations(state))
+    return advance(scheme, model, state, h, warm, root_finder, jnp.array(False))
+
+
+def step(
+    system: System,
+    scheme: AbstractScheme,
+    state: State,
+    args: Args = None,
+    *,
+    h: Real,
+    warm: Warm | None = None,
+    root_finder: optx.AbstractRootFinder = Newton(),
+) -> StepOutput:
+    """Advance one state by one step of length `h`, for loops of your own.
+
+    Never raises on a failure of the step: look at `result`. All of `state`, `args`, `h`
+    and the numbers of the scheme are traced, so the function can be put in `jit`, `vmap`,
+    `lax.scan`, `grad` and `jvp`.
+
+    **Arguments:**
+
+    - `system`, `scheme`, `state`, `args`: as for `simulate`. The state must satisfy the
+      constraints; see `initial_state`.
+    - `h`: length of the step (time), positive.
+    - `warm`: `warm` of the step before, if it had the same `h`. Without it the
+      accelerations and multipliers at `state` are computed to predict the step.
+    - `root_finder`: an optimistix root finder; see `simulate`.
+
+    **Returns:** a `StepOutput`.
+
+    **Raises:** `ValueError` or `TypeError` for wrong shapes, types and signs.
+    """
+    state, args, h = prepare(system, scheme, state, args, h)
+    return _single_step(system, scheme, state, args, h, warm, root_finder)
+
+
+def _solve(
+    scheme: AbstractSingleSolve,
+    model: Model,
+    start: State,
+    h: Scalar,
+    memory: PyTree[Any],
+    root_finder: optx.AbstractRootFinder,
+    skip: Flag,
+):
+    problem = scheme.problem(model, start, h)
+    last = jax.tree.map(lambda x: x[0], memory)
+    unknown_scale, row_scale = _scales(last, model, start, h)
+
+    def scaled(x, inputs):
+        scheme, problem, unknown_scale, row_scale = inputs
+        z = jax.tree.map(jnp.multiply, x, unknown_scale)
+        return jax.tree.map(jnp.divide, scheme.residual(z, problem), row_scale)
+
+    inputs = (scheme, problem, unknown_scale, row_scale)
+    # Smooth motion is met by extrapolation; where it changes quickly the last step is
+    # the better guess. Two residuals are cheap beside one Jacobian.
+    ahead = jax.tree.map(lambda x: 3 * x[0] - 3 * x[1] + x[2], memory)
+    guesses = [jax.tree.map(jnp.divide, z, unknown_scale) for z in (ahead, last)]
+    errors = [max_norm(scaled(x, inputs)) for x in guesses]
+    closer = errors[0] < errors[1]
+    guess = jax.tree.map(lambda a, b: jnp.where(closer, a, b), *guesses)
+    x, iterations, result = find_root(
+        scaled, root_finder, guess, inputs, max_iterations=MAX_ITERATIONS, skip=skip
+    )
+    z = jax.tree.map(jnp.multiply, x, unknown_scale)
+    end = scheme.finish(z, problem)
+    result = first_failure(from_root_finder(result), end.result)
+    memory = jax.tree.map(lambda new, old: jnp.stack([new, old[0], old[1]]), z, memory)
+    return end, iterations, result, memory
+
+
+def _scales(
+    z: PyTree[Any], model: Model, start: State, h: Scalar
+) -> tuple[PyTree[Any], PyTree[Any]]:
+    """The sizes of the unknowns in `z`, and of the rows that stand in their places."""
+    scales = model.scales(start.q)
+    root = jnp.sqrt(model.energy_scale(start, h))
+    is_increment = lambda x: isinstance(x, Increment)
+
+    def unknown(x):
+        if not is_increment(x):
+            return jnp.ones_like(x)
+        joint = scales.constraint[: x.velocity_impulse.size]
+        return Increment(
+            root / scales.coordinate, root / scales.constraint, root / joint
+        )
+
+    def row(x):
+        if not is_increment(x):
+            return jnp.ones_like(x)
+        joint = scales.constraint[: x.velocity_impulse.size]
+        # A constraint is a difference of numbers that can be large against what a step
+        # changes: its rows are resolved to the round-off of those.
+        position = root * scales.constraint + scales.constraint_size / jnp.abs(h)
+        return Increment(root * scales.coordinate, position, root * joint)
+
+    return tuple(
+        jax.tree.map(f, z, is_leaf=is_increment) for f in (unknown, row)
+    )  # pyright: ignore
+
+
+def _first_of(results: RESULTS) -> RESULTS:
+    """The first failure along the leading axis of stacked results."""
+    failed = results != RESULTS.successful
+    first = jnp.argmax(failed)
+    return jax.tree.map(lambda x: x[first], results)

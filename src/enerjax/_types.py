@@ -1,0 +1,17 @@
+from typing import Any, TypeAlias
+
+from jaxtyping import Array, Bool, Float, Int, ScalarLike
+
+
+# Dimensions used in every annotation of the package:
+# nq coordinates, nv velocities, nc constraints (joints first, then those of the
+# coordinates), nj joint constraints. `...` stands for the time axis of a `Solution`.
+Args: TypeAlias = Any
+Scalar: TypeAlias = Float[Array, ""]
+Flag: TypeAlias = Bool[Array, ""]
+Count: TypeAlias = Int[Array, ""]
+Coordinates: TypeAlias = Float[Array, " nq"]
+Velocities: TypeAlias = Float[Array, " nv"]
+Multipliers: TypeAlias = Float[Array, " nc"]
+JointMultipliers: TypeAlias = Float[Array, " nj"]
+Real: TypeAlias = ScalarLike
