@@ -1,5 +1,6 @@
 from importlib.metadata import version as _version
 
+from . import problems as problems
 from ._audit import Audit as Audit
 from ._discrete import (
     AbstractDerivative as AbstractDerivative,

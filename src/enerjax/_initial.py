@@ -114,7 +114,7 @@ def _project_position(
 ) -> tuple[Coordinates, Flag, RESULTS]:
     if model.constraint(guess).size == 0:
         return guess, jnp.array(True), RESULTS.successful
-    metric, scales = model.metric(guess), model.scales(guess)
+    metric, scales = model.metric(guess), model.scales
     size = jnp.max(jnp.abs(guess) * scales.coordinate)
     size = jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
 

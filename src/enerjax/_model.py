@@ -39,6 +39,7 @@ class Model(eqx.Module):
     args: Args
     inertia: Float[Array, "nv nv"]
     inverse_inertia: Float[Array, "nv nv"]
+    scales: Scales
 
     def __init__(self, system: System, state: State, args: Args):
         self.system = system
@@ -55,6 +56,7 @@ class Model(eqx.Module):
         root = jnp.sqrt(jnp.diagonal(self.inertia))
         scale = jnp.outer(root, root)
         self.inverse_inertia = jnp.linalg.inv(self.inertia / scale) / scale
+        self.scales = self._scales(state.q)
 
     def kinetic(self, v: Velocities) -> Scalar:
         return 0.5 * v @ self.inertia @ v
@@ -127,8 +129,8 @@ class Model(eqx.Module):
         unit = rows / jnp.linalg.norm(rows, axis=1, keepdims=True)
         return inertia + jnp.trace(inertia) / q.size * (unit.T @ unit)
 
-    def scales(self, q: Coordinates) -> Scales:
-        """The scales of the unknowns at `q`. They steer Newton, they never enter it."""
+    def _scales(self, q: Coordinates) -> Scales:
+        """The scales at `q`. They steer Newton's tests and never enter a solution."""
         coordinate = jnp.sqrt(jnp.diagonal(self.metric(q)))
         jacobian = self.constraint_jacobian(q)
         squares = (jacobian / coordinate[None, :]) ** 2
@@ -145,7 +147,7 @@ class Model(eqx.Module):
         The larger of the kinetic energy and of what the potential forces, acting for `h`
         on a body at rest, would make of it.
         """
-        pushed = h * self.potential_gradient(state.q) / self.scales(state.q).coordinate
+        pushed = h * self.potential_gradient(state.q) / self.scales.coordinate
         size = jnp.maximum(2 * self.kinetic(state.v), pushed @ pushed)
         return jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
 
@@ -170,7 +172,7 @@ class Model(eqx.Module):
         matrix = jnp.block(
             [[pull(q, self.inertia).T, jacobian.T], [rate_jacobian, corner]]
         )
-        scales = self.scales(q)
+        scales = self.scales
         rows = jnp.concatenate([1 / scales.coordinate, 1 / scales.constraint[:num_joints]])
         columns = jnp.concatenate(
             [1 / jnp.sqrt(jnp.diagonal(self.inertia)), 1 / scales.constraint]

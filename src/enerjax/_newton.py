@@ -22,7 +22,6 @@ from ._types import Count, Flag, Scalar
 class _Iterate(eqx.Module):
     """What Newton carries from one iteration to the next."""
 
-    residual: PyTree[Array]
     correction: Scalar  # size of the last correction
     done: Flag
 
@@ -35,10 +34,11 @@ def max_norm(x: PyTree[Array]) -> Scalar:
 class Newton(optx.AbstractRootFinder):
     """Newton's method on a problem scaled to order one, down to round-off.
 
-    Stops when the residual is round-off, or when the corrections shrink so fast that
-    the error left, predicted from their quadratic convergence, is: with corrections
-    `c_k` the next one is about `c_k (c_k / c_{k-1})^2`. Neither test spends a Jacobian,
-    and the second does not demand a residual below what `fn` can resolve.
+    Stops after the correction that was computed from a residual of round-off size, or
+    whose error, predicted from the quadratic convergence of the corrections `c_k`, is:
+    the next one would be about `c_k (c_k / c_{k-1})^2`. Every residual is evaluated
+    together with its Jacobian, none only to find that it is small, and the second test
+    does not ask for a residual below what `fn` can resolve.
 
     **Arguments:**
 
@@ -54,29 +54,31 @@ class Newton(optx.AbstractRootFinder):
         return max_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        del f_struct, aux_struct, tags
-        residual, _ = fn(y, args)
-        done = self._small(residual) | options.get("skip", False)
-        unknown = jnp.asarray(jnp.inf, ravel_pytree(residual)[0].dtype)
-        return _Iterate(residual, unknown, done)
+        del fn, args, f_struct, aux_struct, tags
+        unknown = jnp.asarray(jnp.inf, ravel_pytree(y)[0].dtype)
+        return _Iterate(unknown, jnp.asarray(options.get("skip", False)))
 
     def step(self, fn, y, args, options, state, tags):
         del options, tags
         flat, unravel = ravel_pytree(y)
-        value, _ = ravel_pytree(state.residual)
-        flat_fn = lambda x: ravel_pytree(fn(unravel(x), args)[0])[0]
-        correction = jnp.linalg.solve(jax.jacfwd(flat_fn)(flat), value)
-        new_y = unravel(flat - correction)
-        residual, aux = fn(new_y, args)
-        size = max_norm(correction)
-        eps = jnp.finfo(size.dtype).eps
+
+        def flat_fn(x):
+            value, aux = fn(unravel(x), args)
+            value = ravel_pytree(value)[0]
+            return value, (value, aux)
+
+        jacobian, (value, aux) = jax.jacfwd(flat_fn, has_aux=True)(flat)
+        correction = jnp.linalg.solve(jacobian, value)
+        size, residual = max_norm(correction), max_norm(value)
         contraction = size / state.correction
-        predicted = size * contraction**2
-        # Without a second correction nothing is known of the curvature; its size must do.
-        predicted = jnp.where(jnp.isinf(state.correction), 1e2 * size**2, predicted)
+        # Before the second correction nothing is known of the curvature: its size must do.
+        predicted = jnp.where(
+            jnp.isinf(state.correction), 1e2 * size**2, size * contraction**2
+        )
+        eps = jnp.finfo(size.dtype).eps
         quadratic = (contraction < 0.1) & (predicted <= self.rtol * eps)
-        done = self._small(residual) | quadratic
-        return new_y, _Iterate(residual, size, done), aux
+        done = quadratic | (residual <= self.atol * eps)
+        return unravel(flat - correction), _Iterate(size, done), aux
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
@@ -85,10 +87,6 @@ class Newton(optx.AbstractRootFinder):
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         del fn, args, options, tags, result
         return y, aux, {}
-
-    def _small(self, residual: PyTree[Array]) -> Flag:
-        size = max_norm(residual)
-        return size <= self.atol * jnp.finfo(size.dtype).eps
 
 
 def _while_loop(cond_fun, body_fun, init, max_steps):

@@ -150,7 +150,7 @@ def _check_start(
     An error there would stay in the energy balance of the first step. The measure is
     the motion or velocity that would repair it, against the sizes of the motion.
     """
-    scales = model.scales(start.q)
+    scales = model.scales
     root = jnp.sqrt(model.energy_scale(start, h))
     # NaN compares false: a start that cannot be measured fails at its first step.
     tolerance = jnp.sqrt(jnp.finfo(h.dtype).eps)

@@ -28,12 +28,12 @@ MAX_ITERATIONS = 50
 
 
 class Warm(eqx.Module):
-    """The unknowns of the last three steps, newest first, for each stage.
+    """What the last three steps added to a free flight, newest first, for each stage.
 
     Pass it from one `step` to the next, with the same `h`, to start Newton closer.
     """
 
-    unknowns: PyTree[Any]
+    added: PyTree[Any]
 
 
 class StepOutput(eqx.Module):
@@ -70,7 +70,8 @@ def first_warm(
     def predict(length):
         problem = scheme.stage.problem(model, start, length * h)
         z = scheme.stage.predict(problem, acceleration, multipliers)
-        return jax.tree.map(lambda x: jnp.stack([x, x, x]), z)
+        flight = _free_flight(scheme.stage, problem, model, start)
+        return jax.tree.map(lambda x, x0: jnp.stack([x - x0] * 3), z, flight)
 
     lengths = jnp.asarray(scheme.stages, h.dtype)
     return Warm(jax.vmap(predict)(lengths))
@@ -97,7 +98,7 @@ def advance(
 
     lengths = jnp.asarray(scheme.stages, h.dtype)
     state, (lengths, reported, memory) = jax.lax.scan(
-        stage, start, (lengths, warm.unknowns)
+        stage, start, (lengths, warm.added)
     )
     multipliers, dissipated, details, iterations, results = reported
     return StepOutput(
@@ -163,8 +164,8 @@ def _solve(
     skip: Flag,
 ):
     problem = scheme.problem(model, start, h)
-    last = jax.tree.map(lambda x: x[0], memory)
-    unknown_scale, row_scale = _scales(last, model, start, h)
+    flight = _free_flight(scheme, problem, model, start)
+    unknown_scale, row_scale = _scales(flight, model, start, h)
 
     def scaled(x, inputs):
         scheme, problem, unknown_scale, row_scale = inputs
@@ -174,26 +175,40 @@ def _solve(
     inputs = (scheme, problem, unknown_scale, row_scale)
     # Smooth motion is met by extrapolation; where it changes quickly the last step is
     # the better guess. Two residuals are cheap beside one Jacobian.
-    ahead = jax.tree.map(lambda x: 3 * x[0] - 3 * x[1] + x[2], memory)
-    guesses = [jax.tree.map(jnp.divide, z, unknown_scale) for z in (ahead, last)]
-    errors = [max_norm(scaled(x, inputs)) for x in guesses]
-    closer = errors[0] < errors[1]
-    guess = jax.tree.map(lambda a, b: jnp.where(closer, a, b), *guesses)
+    def extrapolate(weights):
+        blend = lambda x0, x, unit: (x0 + weights @ x) / unit
+        guess = jax.tree.map(blend, flight, memory, unknown_scale)
+        return guess, max_norm(scaled(guess, inputs))
+
+    weights = jnp.asarray([[3, -3, 1], [1, 0, 0]], start.q.dtype)
+    guesses, errors = jax.vmap(extrapolate)(weights)
+    guess = jax.tree.map(lambda x: x[jnp.argmin(errors)], guesses)
     x, iterations, result = find_root(
         scaled, root_finder, guess, inputs, max_iterations=MAX_ITERATIONS, skip=skip
     )
     z = jax.tree.map(jnp.multiply, x, unknown_scale)
     end = scheme.finish(z, problem)
     result = first_failure(from_root_finder(result), end.result)
-    memory = jax.tree.map(lambda new, old: jnp.stack([new, old[0], old[1]]), z, memory)
+    memory = jax.tree.map(
+        lambda x, x0, old: jnp.stack([x - x0, old[0], old[1]]), z, flight, memory
+    )
     return end, iterations, result, memory
+
+
+def _free_flight(
+    scheme: AbstractSingleSolve, problem: Any, model: Model, start: State
+) -> PyTree[Any]:
+    """The unknowns of a step in which no force acts."""
+    num_constraints = jax.eval_shape(model.constraint, start.q).shape[0]
+    no_force = jnp.zeros((num_constraints,), start.q.dtype)
+    return scheme.predict(problem, jnp.zeros_like(start.v), no_force)
 
 
 def _scales(
     z: PyTree[Any], model: Model, start: State, h: Scalar
 ) -> tuple[PyTree[Any], PyTree[Any]]:
     """The sizes of the unknowns in `z`, and of the rows that stand in their places."""
-    scales = model.scales(start.q)
+    scales = model.scales
     root = jnp.sqrt(model.energy_scale(start, h))
     is_increment = lambda x: isinstance(x, Increment)
 

@@ -31,7 +31,9 @@ class Composed(AbstractScheme):
     """
 
     scheme: AbstractSingleSolve
-    target: int = eqx.field(static=True)
+    # Static, and known when the composition is made: under a transformation the numbers
+    # of the scheme are traced, and whether alpha is 0 can no longer be seen.
+    orders: tuple[int, int] = eqx.field(static=True)
 
     def __init__(self, scheme: AbstractSingleSolve, order: int):
         name = type(scheme).__name__
@@ -47,15 +49,15 @@ class Composed(AbstractScheme):
                 f"{scheme.order} of the scheme itself."
             )
         self.scheme = scheme
-        self.target = order
+        self.orders = (scheme.order, order)
 
     @property
     def order(self) -> int:
-        return self.target
+        return self.orders[1]
 
     @property
     def stages(self) -> tuple[float, ...]:
-        half = _HALVES[self.scheme.order, self.target]
+        half = _HALVES[self.orders]
         return (*half, 1 - 2 * sum(half), *reversed(half))
 
     @property
