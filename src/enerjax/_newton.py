@@ -23,12 +23,18 @@ class _Iterate(eqx.Module):
     """What Newton carries from one iteration to the next."""
 
     correction: Scalar  # size of the last correction
+    count: Count
     done: Flag
 
 
 def max_norm(x: PyTree[Array]) -> Scalar:
     """The largest entry; for all residuals and corrections here are of order one."""
     return jnp.max(jnp.abs(ravel_pytree(x)[0]), initial=0.0)
+
+
+# Iterations after which a first guess is given up, if there is a second one. Where
+# quadratic convergence sets in at all, it does so before.
+_PATIENCE = 12
 
 
 class Newton(optx.AbstractRootFinder):
@@ -39,6 +45,9 @@ class Newton(optx.AbstractRootFinder):
     the next one would be about `c_k (c_k / c_{k-1})^2`. Every residual is evaluated
     together with its Jacobian, none only to find that it is small, and the second test
     does not ask for a residual below what `fn` can resolve.
+
+    An iteration that breaks down, or has not converged after 12 corrections, begins
+    again from `options["second_guess"]` if that is given.
 
     **Arguments:**
 
@@ -56,10 +65,11 @@ class Newton(optx.AbstractRootFinder):
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
         del fn, args, f_struct, aux_struct, tags
         unknown = jnp.asarray(jnp.inf, ravel_pytree(y)[0].dtype)
-        return _Iterate(unknown, jnp.asarray(options.get("skip", False)))
+        skip = jnp.asarray(options.get("skip", False))
+        return _Iterate(unknown, jnp.array(0), skip)
 
     def step(self, fn, y, args, options, state, tags):
-        del options, tags
+        del tags
         flat, unravel = ravel_pytree(y)
 
         def flat_fn(x):
@@ -78,7 +88,14 @@ class Newton(optx.AbstractRootFinder):
         eps = jnp.finfo(size.dtype).eps
         quadratic = (contraction < 0.1) & (predicted <= self.rtol * eps)
         done = quadratic | (residual <= self.atol * eps)
-        return unravel(flat - correction), _Iterate(size, done), aux
+        count, flat = state.count + 1, flat - correction
+        if options.get("second_guess") is not None:
+            lost = ~jnp.isfinite(size) | (count == _PATIENCE)
+            again = lost & ~done & (count <= _PATIENCE)
+            flat = jnp.where(again, ravel_pytree(options["second_guess"])[0], flat)
+            size = jnp.where(again, jnp.inf, size)
+            count = jnp.where(again, _PATIENCE + 1, count)
+        return unravel(flat), _Iterate(size, count, done), aux
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
@@ -152,6 +169,7 @@ def find_root(
     args: PyTree,
     *,
     max_iterations: int,
+    second_guess: PyTree[Array] | None = None,
     skip: Flag | bool = False,
 ) -> tuple[PyTree[Array], Count, optx.RESULTS]:
     """The root of `fn(y, args)`, the iterations spent, and how they ended.
@@ -163,7 +181,7 @@ def find_root(
         root_finder,
         guess,
         args,
-        options={"skip": skip},
+        options={"skip": skip, "second_guess": second_guess},
         max_steps=max_iterations,
         adjoint=ImplicitFunction(),
         throw=False,

@@ -184,7 +184,15 @@ def _solve(
     guesses, errors = jax.vmap(extrapolate)(weights)
     guess = jax.tree.map(lambda x: x[jnp.argmin(errors)], guesses)
     x, iterations, result = find_root(
-        scaled, root_finder, guess, inputs, max_iterations=MAX_ITERATIONS, skip=skip
+        scaled,
+        root_finder,
+        guess,
+        inputs,
+        max_iterations=MAX_ITERATIONS,
+        # What the last steps suggest can lie beyond a fold of the step equations; the
+        # flight without force starts on the near side.
+        second_guess=jax.tree.map(jnp.divide, flight, unknown_scale),
+        skip=skip,
     )
     z = jax.tree.map(jnp.multiply, x, unknown_scale)
     end = scheme.finish(z, problem)
