@@ -18,6 +18,7 @@ from jaxtyping import Array
 from ._kinematics import ConfigurationKinematics
 from ._schemes import AbstractScheme
 from ._system import State, System
+from ._tracing import is_known
 from ._types import Args, Real, Scalar
 
 
@@ -60,18 +61,13 @@ def check_system(system: System, state: State, args: Args) -> tuple[State, Args]
             )
     if q.dtype != v.dtype:
         raise TypeError(f"`q` is {q.dtype} and `v` is {v.dtype}: give both one dtype.")
-    if q.dtype == jnp.float32 and not jax.config.jax_enable_x64:
+    if q.dtype == jnp.float32 and not jax.config.read("jax_enable_x64"):
         _warn_single_precision()
     args = jax.tree.map(lambda x: _as_array(x, q.dtype), args)
     _check_shapes(system, state, args)
     if is_known((system, state, args)):
         _check_values(system, state, args)
     return state, args
-
-
-def is_known(tree: Any) -> bool:
-    """Whether no leaf is being traced."""
-    return not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(tree))
 
 
 @functools.cache
@@ -91,7 +87,7 @@ def _as_array(x: Any, dtype: Any) -> Any:
     return jnp.asarray(x) if isinstance(x, np.ndarray) else x
 
 
-def _describe(role: str, fn: Callable) -> str:
+def _describe(role: str, fn: Any) -> str:
     name = getattr(fn, "__name__", None)
     return f"`{role}`" if name in (None, role, "<lambda>") else f"`{role}` (`{name}`)"
 
@@ -168,7 +164,9 @@ def _facts(system: System, state: State, args: Args) -> dict[str, Array]:
         rest = jnp.zeros_like(v)
         inertia = jax.hessian(energy)(rest)
         # A probe with no symmetry, of the size of the velocities.
-        probe = (1 + jnp.max(jnp.abs(v))) * jnp.cos(jnp.arange(1, v.size + 1, dtype=v.dtype))
+        probe = (1 + jnp.max(jnp.abs(v))) * jnp.cos(
+            jnp.arange(1, v.size + 1, dtype=v.dtype)
+        )
         quadratic = 0.5 * probe @ inertia @ probe
         error = jnp.abs(energy(probe) - quadratic) + jnp.abs(energy(-probe) - quadratic)
         size = jnp.abs(probe) @ jnp.abs(inertia) @ jnp.abs(probe)

@@ -3,14 +3,15 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from ._check import check_system, is_known
+from ._check import check_system
 from ._model import Model
 from ._newton import find_root, Newton
 from ._results import from_root_finder, RESULTS
 from ._system import State, System
-from ._types import Args, Coordinates, Flag, Multipliers, Velocities
+from ._tracing import is_known
+from ._types import Args, Coordinates, Flag, Multipliers, Vector, Velocities
 
 
 class ConsistentStart(eqx.Module):
@@ -33,9 +34,7 @@ class ConsistentStart(eqx.Module):
     rate_after: Float[Array, " nj"]
 
 
-def initial_state(
-    system: System, q: ArrayLike, v: ArrayLike, args: Args = None
-) -> State:
+def initial_state(system: System, q: Vector, v: Vector, args: Args = None) -> State:
     """The `State` nearest to `(q, v)` that satisfies the constraints.
 
     As `consistent_start`, of which it returns the state alone.
@@ -44,7 +43,7 @@ def initial_state(
 
 
 def consistent_start(
-    system: System, q: ArrayLike, v: ArrayLike, args: Args = None
+    system: System, q: Vector, v: Vector, args: Args = None
 ) -> ConsistentStart:
     """Projects a start onto the constraints and solves for what is in balance there.
 

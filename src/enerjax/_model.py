@@ -46,9 +46,9 @@ class Model(eqx.Module):
         self.args = args
         if callable(system.kinetic):
             rest = jnp.zeros_like(state.v)
-            self.inertia = jax.hessian(lambda v: system.kinetic_energy(State(state.q, v), args))(
-                rest
-            )
+            self.inertia = jax.hessian(
+                lambda v: system.kinetic_energy(State(state.q, v), args)
+            )(rest)
         else:
             self.inertia = system.kinetic.astype(state.v.dtype)
         # Scaled to a unit diagonal first: a diagonal inertia is then inverted to the last
@@ -100,9 +100,7 @@ class Model(eqx.Module):
 
     def lift(self, q: Coordinates, v: Velocities) -> Coordinates:
         """`L(q)^+ v`, the rates of the coordinates."""
-        return self.system.kinematics.lift(
-            q, v, jax.jacfwd(self.coordinate), self.args
-        )
+        return self.system.kinematics.lift(q, v, jax.jacfwd(self.coordinate), self.args)
 
     def gyroscopic(
         self, q: Coordinates, v: Velocities, dq: Coordinates
@@ -169,15 +167,13 @@ class Model(eqx.Module):
         _, drift = jax.jvp(lambda x: self.joint_rate(x, v), (q,), (qdot,))
         num_joints = rate_jacobian.shape[0]
         corner = jnp.zeros((num_joints, jacobian.shape[0]), q.dtype)
-        matrix = jnp.block(
-            [[pull(q, self.inertia).T, jacobian.T], [rate_jacobian, corner]]
-        )
+        matrix = jnp.block([[pull(q, self.inertia).T, jacobian.T], [rate_jacobian, corner]])
         scales = self.scales
         rows = jnp.concatenate([1 / scales.coordinate, 1 / scales.constraint[:num_joints]])
         columns = jnp.concatenate(
             [1 / jnp.sqrt(jnp.diagonal(self.inertia)), 1 / scales.constraint]
         )
-        solution = columns * jnp.linalg.solve(
-            rows[:, None] * matrix * columns[None, :], rows * jnp.concatenate([force, -drift])
-        )
+        scaled = rows[:, None] * matrix * columns[None, :]
+        right = rows * jnp.concatenate([force, -drift])
+        solution = columns * jnp.linalg.solve(scaled, right)
         return solution[: v.size], solution[v.size :]

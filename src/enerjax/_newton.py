@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, PyTree
 
 from ._types import Count, Flag, Scalar
 
@@ -53,14 +53,12 @@ class Newton(optx.AbstractRootFinder):
 
     - `rtol`: bound on the predicted error, in units of round-off of the dtype.
     - `atol`: bound on the residual, in the same units.
+    - `norm`: the norm of both.
     """
 
     rtol: float = 8.0
     atol: float = 8.0
-
-    @property
-    def norm(self) -> Callable[[PyTree[Array]], Scalar]:  # pyright: ignore
-        return max_norm
+    norm: Callable[[PyTree[Array]], Scalar] = max_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
         del fn, args, f_struct, aux_struct, tags
@@ -79,7 +77,7 @@ class Newton(optx.AbstractRootFinder):
 
         jacobian, (value, aux) = jax.jacfwd(flat_fn, has_aux=True)(flat)
         correction = jnp.linalg.solve(jacobian, value)
-        size, residual = max_norm(correction), max_norm(value)
+        size, residual = self.norm(correction), self.norm(value)
         contraction = size / state.correction
         # Before the second correction nothing is known of the curvature: its size must do.
         predicted = jnp.where(
@@ -187,5 +185,3 @@ def find_root(
         throw=False,
     )
     return solution.value, solution.stats["num_steps"], solution.result
-
-

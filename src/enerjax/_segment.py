@@ -63,9 +63,7 @@ class Segment(eqx.Module):
         """`Lm rate`"""
         return self.model.push(self._middle(), rate)
 
-    def momentum(
-        self, va: Velocities, vb: Velocities, dq: Coordinates
-    ) -> Coordinates:
+    def momentum(self, va: Velocities, vb: Velocities, dq: Coordinates) -> Coordinates:
         """`Lm^T M (vb - va) + G(q_m, M v_m) dq`"""
         middle = self._middle()
         change = self.model.pull(middle, self.model.inertia @ (vb - va))
@@ -97,9 +95,7 @@ class Segment(eqx.Module):
         return 0.5 * (self.qa + self.qb)
 
 
-def reaction(
-    model: Model, q: Coordinates, eta: JointMultipliers
-) -> Velocities | float:
+def reaction(model: Model, q: Coordinates, eta: JointMultipliers) -> Velocities | float:
     """`M^-1 C(q)^T eta`: the velocity that velocity-level multipliers cause at `q`."""
     if eta.size == 0:
         return 0.0

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import optimistix as optx
 
 from ._audit import audit
-from ._check import is_known, prepare
+from ._check import prepare
 from ._model import Model
 from ._newton import Newton
 from ._results import first_failure, RESULTS
@@ -12,6 +12,7 @@ from ._schemes import AbstractScheme
 from ._solution import Solution, Statistics
 from ._step import advance, first_warm, Warm
 from ._system import State, System
+from ._tracing import is_known
 from ._types import Args, Count, Flag, Real, Scalar
 
 
@@ -72,9 +73,7 @@ def simulate(
             f"`num_steps` ({num_steps}) must be a multiple of `save_every` ({save_every})."
         )
     start, args, h = prepare(system, scheme, start, args, h)
-    solution = _run(
-        system, scheme, start, args, h, root_finder, num_steps, save_every
-    )
+    solution = _run(system, scheme, start, args, h, root_finder, num_steps, save_every)
     return _raise_failure(solution, h) if throw else solution
 
 
@@ -89,9 +88,7 @@ def _run(system, scheme, start, args, h, root_finder, num_steps, save_every):
         out = advance(scheme, model, carry.state, h, carry.warm, root_finder, skip)
         result = first_failure(carry.result, out.result)
         good = result == RESULTS.successful
-        state, memory = _select(
-            good, (out.state, out.warm), (carry.state, carry.warm)
-        )
+        state, memory = _select(good, (out.state, out.warm), (carry.state, carry.warm))
         completed = carry.completed + good.astype(carry.completed.dtype)
         reported = (out.multipliers, out.details)
         return _Carry(state, memory, result, completed), (
@@ -142,9 +139,7 @@ def _nan_unless(good: Flag, tree):
     return jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), tree)
 
 
-def _check_start(
-    scheme: AbstractScheme, model: Model, start: State, h: Scalar
-) -> RESULTS:
+def _check_start(scheme: AbstractScheme, model: Model, start: State, h: Scalar) -> RESULTS:
     """Whether the start satisfies what the scheme holds, to half the digits.
 
     An error there would stay in the energy balance of the first step. The measure is

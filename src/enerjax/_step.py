@@ -97,9 +97,7 @@ def advance(
         return end.state, (length, reported, memory)
 
     lengths = jnp.asarray(scheme.stages, h.dtype)
-    state, (lengths, reported, memory) = jax.lax.scan(
-        stage, start, (lengths, warm.added)
-    )
+    state, (lengths, reported, memory) = jax.lax.scan(stage, start, (lengths, warm.added))
     multipliers, dissipated, details, iterations, results = reported
     return StepOutput(
         state,
@@ -173,6 +171,7 @@ def _solve(
         return jax.tree.map(jnp.divide, scheme.residual(z, problem), row_scale)
 
     inputs = (scheme, problem, unknown_scale, row_scale)
+
     # Smooth motion is met by extrapolation; where it changes quickly the last step is
     # the better guess. Two residuals are cheap beside one Jacobian.
     def extrapolate(weights):
@@ -224,9 +223,7 @@ def _scales(
         if not is_increment(x):
             return jnp.ones_like(x)
         joint = scales.constraint[: x.velocity_impulse.size]
-        return Increment(
-            root / scales.coordinate, root / scales.constraint, root / joint
-        )
+        return Increment(root / scales.coordinate, root / scales.constraint, root / joint)
 
     def row(x):
         if not is_increment(x):
@@ -237,9 +234,7 @@ def _scales(
         position = root * scales.constraint + scales.constraint_size / jnp.abs(h)
         return Increment(root * scales.coordinate, position, root * joint)
 
-    return tuple(
-        jax.tree.map(f, z, is_leaf=is_increment) for f in (unknown, row)
-    )  # pyright: ignore
+    return tuple(jax.tree.map(f, z, is_leaf=is_increment) for f in (unknown, row))  # pyright: ignore
 
 
 def _first_of(results: RESULTS) -> RESULTS:

@@ -1,6 +1,7 @@
+from collections.abc import Sequence
 from typing import Any, TypeAlias
 
-from jaxtyping import Array, Bool, Float, Int, ScalarLike
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, ScalarLike
 
 
 # Dimensions used in every annotation of the package:
@@ -14,4 +15,6 @@ Coordinates: TypeAlias = Float[Array, " nq"]
 Velocities: TypeAlias = Float[Array, " nv"]
 Multipliers: TypeAlias = Float[Array, " nc"]
 JointMultipliers: TypeAlias = Float[Array, " nj"]
+# What users may write for a number and for a vector.
 Real: TypeAlias = ScalarLike
+Vector: TypeAlias = ArrayLike | Sequence[ScalarLike]

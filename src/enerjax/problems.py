@@ -4,7 +4,6 @@ Each function builds a `Problem`; calls with other numbers share one compiled pr
 Units are SI. In the plane gravity acts along +y; in space along -z.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ from jaxtyping import Array, Float
 
 from ._initial import initial_state
 from ._system import State, System
-from ._types import Args, Coordinates, Multipliers, Real, Scalar, Velocities
+from ._types import Args, Coordinates, Multipliers, Real, Scalar, Vector, Velocities
 
 
 class Problem(NamedTuple):
@@ -26,7 +25,7 @@ class Problem(NamedTuple):
     args: Args
 
 
-def _problem(system: System, q: Sequence[float], v: Sequence[float], args: Args) -> Problem:
+def _problem(system: System, q: Vector, v: Vector, args: Args) -> Problem:
     return Problem(system, initial_state(system, q, v, args), args)
 
 
@@ -68,7 +67,9 @@ def pendulum(m: Real = 1.0, l: Real = 1.0, g: Real = 9.81) -> Problem:
     **Source:** E. Lens and A. Cardona, section 3 b.
     """
     args = dict(m=m, l=l, g=g)
-    return _problem(System(_point_kinetic, _point_potential, _rod), [l, 0.0], [0.0, 0.0], args)
+    return _problem(
+        System(_point_kinetic, _point_potential, _rod), [l, 0.0], [0.0, 0.0], args
+    )
 
 
 def _double_kinetic(v: Velocities, args: Args) -> Scalar:
@@ -81,9 +82,7 @@ def _double_potential(q: Coordinates, args: Args) -> Scalar:
 
 def _double_rods(q: Coordinates, args: Args) -> Multipliers:
     inner, outer = q[:2], q[2:] - q[:2]
-    return jnp.array(
-        [inner @ inner - args["l1"] ** 2, outer @ outer - args["l2"] ** 2]
-    )
+    return jnp.array([inner @ inner - args["l1"] ** 2, outer @ outer - args["l2"] ** 2])
 
 
 def double_pendulum(
@@ -187,14 +186,11 @@ def four_particles() -> Problem:
 
 def _rotation(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
     """The rotation matrix, quadratic in `p` (orthogonal where `|p| = 1`)."""
-    e0, e1, e2, e3 = p
-    return jnp.array(
-        [
-            [e0**2 + e1**2 - e2**2 - e3**2, 2 * (e1 * e2 - e0 * e3), 2 * (e1 * e3 + e0 * e2)],
-            [2 * (e1 * e2 + e0 * e3), e0**2 - e1**2 + e2**2 - e3**2, 2 * (e2 * e3 - e0 * e1)],
-            [2 * (e1 * e3 - e0 * e2), 2 * (e2 * e3 + e0 * e1), e0**2 - e1**2 - e2**2 + e3**2],
-        ]
-    )
+    scalar, vector = p[0], p[1:]
+    x, y, z = vector
+    cross = jnp.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    isotropic = (scalar**2 - vector @ vector) * jnp.eye(3, dtype=p.dtype)
+    return isotropic + 2 * (jnp.outer(vector, vector) + scalar * cross)
 
 
 def _body_rates(p: Float[Array, "4"]) -> Float[Array, "3 4"]:

@@ -1,11 +1,11 @@
 """What the discontinuous schemes have in common."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
 from .._segment import Increment
 from .._system import State
+from .._tracing import is_known
 from .._types import Coordinates, Multipliers, Real, Scalar, Velocities
 from .base import StepProblem
 
@@ -20,7 +20,7 @@ class JumpAndEnd(eqx.Module):
 def as_alpha(alpha: Real) -> Scalar:
     """Checks a dissipation parameter where its value can be known."""
     alpha = jnp.asarray(alpha, float)
-    if not isinstance(alpha, jax.core.Tracer) and not jnp.all((alpha >= 0) & (alpha <= 1)):
+    if is_known(alpha) and not jnp.all((alpha >= 0) & (alpha <= 1)):
         raise ValueError(
             f"alpha = {alpha} lies outside [0, 1]: 0 preserves the energy, 1 annihilates "
             "the highest frequencies in one step; beyond, the scheme would feed energy in."
@@ -31,9 +31,7 @@ def as_alpha(alpha: Real) -> Scalar:
 def alpha_from_spectral_radius(rho_inf: Real) -> Scalar:
     """`alpha = (1 - rho_inf) / (1 + rho_inf)`"""
     rho_inf = jnp.asarray(rho_inf, float)
-    if not isinstance(rho_inf, jax.core.Tracer) and not jnp.all(
-        (rho_inf >= 0) & (rho_inf <= 1)
-    ):
+    if is_known(rho_inf) and not jnp.all((rho_inf >= 0) & (rho_inf <= 1)):
         raise ValueError(
             f"rho_inf = {rho_inf} lies outside [0, 1]: it is the factor by which a step "
             "multiplies the amplitude of an infinitely fast oscillation."

@@ -23,6 +23,7 @@ from .._types import (
 # Gupta and Leimkuhler; or positions only.
 Formulation: TypeAlias = Literal["ggl", "index3"]
 Z = TypeVar("Z")
+P = TypeVar("P")
 
 
 class StepProblem(eqx.Module):
@@ -99,15 +100,13 @@ class AbstractScheme(eqx.Module):
         """The scheme of each of these solves."""
 
 
-class AbstractSingleSolve(AbstractScheme, Generic[Z]):
+class AbstractSingleSolve(AbstractScheme, Generic[Z, P]):
     """A scheme whose step is one nonlinear solve.
 
     `Z` is a pytree of `Increment`s, one for each node of the step, and of the scheme's
     own scalar unknowns, which must be dimensionless. `residual` returns the same
-    structure, with rows in the places of the unknowns.
+    structure, with rows in the places of the unknowns. `P` is what stays fixed in a step.
     """
-
-    formulation: eqx.AbstractVar[Formulation]
 
     @property
     def stages(self) -> tuple[float, ...]:
@@ -119,25 +118,28 @@ class AbstractSingleSolve(AbstractScheme, Generic[Z]):
 
     @property
     @abc.abstractmethod
+    def formulation(self) -> Formulation:
+        """The levels at which joints are held."""
+
+    @property
+    @abc.abstractmethod
     def symmetric(self) -> bool:
         """Whether a step of `-h` undoes a step of `h`: such a scheme can be composed."""
 
     @abc.abstractmethod
-    def problem(self, model: Model, start: State, h: Scalar) -> StepProblem:
-        """The step's data. What is to stay fixed during the solve is computed here."""
+    def problem(self, model: Model, start: State, h: Scalar) -> P:
+        """The data of a step: a `StepProblem`, or one with more that stays fixed."""
 
     @abc.abstractmethod
-    def predict(
-        self, problem: StepProblem, acceleration: Velocities, multipliers: Multipliers
-    ) -> Z:
+    def predict(self, problem: P, acceleration: Velocities, multipliers: Multipliers) -> Z:
         """A first guess from the accelerations and multipliers at the start."""
 
     @abc.abstractmethod
-    def residual(self, z: Z, problem: StepProblem) -> Z:
+    def residual(self, z: Z, problem: P) -> Z:
         """The step equations; zero at the solution."""
 
     @abc.abstractmethod
-    def finish(self, z: Z, problem: StepProblem) -> StepEnd:
+    def finish(self, z: Z, problem: P) -> StepEnd:
         """The end of the step from the solved unknowns."""
 
 

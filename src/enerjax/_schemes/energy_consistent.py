@@ -8,6 +8,7 @@ from .._model import Model
 from .._results import RESULTS
 from .._segment import Increment
 from .._system import State
+from .._tracing import is_known
 from .._types import Coordinates, Multipliers, Real, Scalar, Velocities
 from ._decaying import alpha_from_spectral_radius, as_alpha
 from .base import AbstractSingleSolve, Formulation, StepEnd, StepProblem
@@ -23,7 +24,7 @@ class _Frozen(eqx.Module):
     jump: Float[Array, "nq nq"]
 
 
-class EnergyConsistent(AbstractSingleSolve[Increment]):
+class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
     r"""One interval, order 4 or 3, and decay for any potential.
 
     The jump `j` of the discontinuous schemes in closed form, so that the unknowns are
@@ -71,7 +72,7 @@ class EnergyConsistent(AbstractSingleSolve[Increment]):
         cls, rho_inf: Real, derivative: AbstractDerivative = MeanValue(points=2)
     ) -> "EnergyConsistent":
         """The scheme whose high-frequency limit is `rho_inf`, in [0, 1]."""
-        return cls(alpha_from_spectral_radius(rho_inf), derivative)
+        return cls(alpha=alpha_from_spectral_radius(rho_inf), derivative=derivative)
 
     @property
     def formulation(self) -> Formulation:
@@ -79,8 +80,7 @@ class EnergyConsistent(AbstractSingleSolve[Increment]):
 
     @property
     def symmetric(self) -> bool:
-        known = not isinstance(self.alpha, jax.core.Tracer)
-        return known and bool(jnp.all(self.alpha == 0))
+        return is_known(self.alpha) and bool(jnp.all(self.alpha == 0))
 
     @property
     def order(self) -> int:
@@ -129,9 +129,7 @@ class EnergyConsistent(AbstractSingleSolve[Increment]):
         alpha = self._alpha(h)
         jump_q = -h / 6 * (end.v - step.start.v - alpha * jump_v)
         size = jump_q @ problem.stiffness @ jump_q + 2 * step.model.kinetic(jump_v)
-        return StepEnd(
-            end, z.impulse / h, 0.5 * alpha * size, None, RESULTS.successful
-        )
+        return StepEnd(end, z.impulse / h, 0.5 * alpha * size, None, RESULTS.successful)
 
     def _alpha(self, h: Scalar) -> Scalar:
         return self.alpha.astype(h.dtype)
@@ -140,9 +138,7 @@ class EnergyConsistent(AbstractSingleSolve[Increment]):
         """`h K x` with the stiffness at the midpoint."""
         step = problem.step
         middle = step.start.q + 0.5 * step.h * z.rate
-        forces = jax.grad(
-            lambda q: step.h * _strain(step.model, q, z.impulse / step.h)
-        )
+        forces = jax.grad(lambda q: step.h * _strain(step.model, q, z.impulse / step.h))
         return jax.jvp(forces, (middle,), (x,))[1]
 
     def _end(self, z: Increment, problem: _Frozen) -> tuple[State, Velocities]:
@@ -193,9 +189,7 @@ def _positive_part_jvp(primals, tangents):
     positive = jnp.maximum(values, 0)
     rows, columns = values[:, None], values[None, :]
     mixed = (rows > 0) != (columns > 0)
-    quotient = (positive[:, None] - positive[None, :]) / jnp.where(
-        mixed, rows - columns, 1
-    )
+    quotient = (positive[:, None] - positive[None, :]) / jnp.where(mixed, rows - columns, 1)
     factor = jnp.where(mixed, quotient, (rows > 0).astype(x.dtype))
     inner = factor * (vectors.T @ dx @ vectors)
     value = (vectors * positive[None, :]) @ vectors.T

@@ -1,15 +1,13 @@
 import equinox as eqx
-import jax.numpy as jnp
 
 from .._discrete import AbstractDerivative, Gonzalez
 from .._model import Model
 from .._results import RESULTS
-from .._segment import Increment
 from .._system import State
 from .._types import Multipliers, Real, Scalar, Velocities
 from ._decaying import (
-    as_alpha,
     alpha_from_spectral_radius,
+    as_alpha,
     jump_energy,
     JumpAndEnd,
     momentum_rows,
@@ -25,7 +23,7 @@ from .base import (
 )
 
 
-class EnergyDecaying(AbstractSingleSolve[JumpAndEnd]):
+class EnergyDecaying(AbstractSingleSolve[JumpAndEnd, StepProblem]):
     """Discontinuous Galerkin scheme: the energy decays by `alpha` times a jump.
 
     The state jumps from `z0` to `zj` at the start of the step and moves on to `z1`:
@@ -58,7 +56,9 @@ class EnergyDecaying(AbstractSingleSolve[JumpAndEnd]):
     """
 
     alpha: Scalar = eqx.field(converter=as_alpha)
-    formulation: Formulation = eqx.field(default="ggl", static=True)
+    formulation: Formulation = eqx.field(  # pyright: ignore[reportIncompatibleMethodOverride]
+        default="ggl", static=True
+    )
     derivative: AbstractDerivative = Gonzalez()
 
     def __check_init__(self):
@@ -72,7 +72,8 @@ class EnergyDecaying(AbstractSingleSolve[JumpAndEnd]):
         derivative: AbstractDerivative = Gonzalez(),
     ) -> "EnergyDecaying":
         """The scheme whose high-frequency limit is `rho_inf`, in [0, 1]."""
-        return cls(alpha_from_spectral_radius(rho_inf), formulation, derivative)
+        alpha = alpha_from_spectral_radius(rho_inf)
+        return cls(alpha=alpha, formulation=formulation, derivative=derivative)
 
     @property
     def order(self) -> int:

@@ -16,7 +16,7 @@ from .base import (
 )
 
 
-class EnergyPreserving(AbstractSingleSolve[Increment]):
+class EnergyPreserving(AbstractSingleSolve[Increment, StepProblem]):
     """Continuous Galerkin scheme: keeps the total energy, damps nothing.
 
     Solves `S(z0, z1, DH(z0, z1)) = 0` with the constraints at the end of the step.
@@ -36,7 +36,9 @@ class EnergyPreserving(AbstractSingleSolve[Increment]):
     the stabilisation of C. W. Gear, B. Leimkuhler and G. K. Gupta (1985).
     """
 
-    formulation: Formulation = eqx.field(default="ggl", static=True)
+    formulation: Formulation = eqx.field(  # pyright: ignore[reportIncompatibleMethodOverride]
+        default="ggl", static=True
+    )
     derivative: AbstractDerivative = Gonzalez()
 
     def __check_init__(self):

@@ -25,7 +25,7 @@ class _Unknowns(eqx.Module):
     kappa: Float[Array, " 0or1"]
 
 
-class KappaDecaying(AbstractSingleSolve[_Unknowns]):
+class KappaDecaying(AbstractSingleSolve[_Unknowns, StepProblem]):
     """The paper's decaying scheme with velocity constraints and the parameter kappa.
 
     Like `EnergyDecaying`, but with the velocity-level multipliers interpolated between
