@@ -17,8 +17,8 @@ from ._check import prepare
 from ._model import Model
 from ._newton import find_root, max_norm, Newton
 from ._results import first_failure, from_root_finder, RESULTS
+from ._scaling import scales_like
 from ._schemes import AbstractScheme, AbstractSingleSolve
-from ._segment import Increment
 from ._system import State, System
 from ._types import Args, Count, Flag, Multipliers, Real, Scalar, Velocities
 
@@ -163,7 +163,7 @@ def _solve(
 ):
     problem = scheme.problem(model, start, h)
     flight = _free_flight(scheme, problem, model, start)
-    unknown_scale, row_scale = _scales(flight, model, start, h)
+    unknown_scale, row_scale = scales_like(flight, model, start, h)
 
     def scaled(x, inputs):
         scheme, problem, unknown_scale, row_scale = inputs
@@ -209,32 +209,6 @@ def _free_flight(
     num_constraints = jax.eval_shape(model.constraint, start.q).shape[0]
     no_force = jnp.zeros((num_constraints,), start.q.dtype)
     return scheme.predict(problem, jnp.zeros_like(start.v), no_force)
-
-
-def _scales(
-    z: PyTree[Any], model: Model, start: State, h: Scalar
-) -> tuple[PyTree[Any], PyTree[Any]]:
-    """The sizes of the unknowns in `z`, and of the rows that stand in their places."""
-    scales = model.scales
-    root = jnp.sqrt(model.energy_scale(start, h))
-    is_increment = lambda x: isinstance(x, Increment)
-
-    def unknown(x):
-        if not is_increment(x):
-            return jnp.ones_like(x)
-        joint = scales.constraint[: x.velocity_impulse.size]
-        return Increment(root / scales.coordinate, root / scales.constraint, root / joint)
-
-    def row(x):
-        if not is_increment(x):
-            return jnp.ones_like(x)
-        joint = scales.constraint[: x.velocity_impulse.size]
-        # A constraint is a difference of numbers that can be large against what a step
-        # changes: its rows are resolved to the round-off of those.
-        position = root * scales.constraint + scales.constraint_size / jnp.abs(h)
-        return Increment(root * scales.coordinate, position, root * joint)
-
-    return tuple(jax.tree.map(f, z, is_leaf=is_increment) for f in (unknown, row))  # pyright: ignore
 
 
 def _first_of(results: RESULTS) -> RESULTS:

@@ -11,6 +11,7 @@ from .._system import State
 from .._tracing import is_known
 from .._types import Coordinates, Multipliers, Real, Scalar, Velocities
 from ._decaying import alpha_from_spectral_radius, as_alpha
+from ._semidefinite import semidefinite_part
 from .base import AbstractSingleSolve, Formulation, StepEnd, StepProblem
 
 
@@ -101,7 +102,7 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
         _, multipliers = model.accelerations(start)
         middle = start.q + 0.5 * h * start.v
         stiffness = jax.hessian(lambda q: _strain(model, q, multipliers))(middle)
-        stiffness = _semidefinite_part(stiffness, model.inertia)
+        stiffness = semidefinite_part(stiffness, model.inertia)
         lag = self.alpha.astype(h.dtype) * h / 6
         jump = jnp.linalg.solve(model.inertia + lag**2 * stiffness, h / 6 * stiffness)
         return _Frozen(step, stiffness, jump)
@@ -162,35 +163,3 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
 def _strain(model: Model, q: Coordinates, multipliers: Multipliers) -> Scalar:
     """`V + lambda . Phi`, the energy whose Hessian is the stiffness."""
     return model.potential(q) + multipliers @ model.constraint(q)
-
-
-def _semidefinite_part(
-    stiffness: Float[Array, "nq nq"], inertia: Float[Array, "nq nq"]
-) -> Float[Array, "nq nq"]:
-    """Positive semidefinite part in the metric of the inertia: independent of units."""
-    root = jnp.linalg.cholesky(inertia)
-    half = jax.scipy.linalg.solve_triangular(root, stiffness, lower=True)
-    whole = jax.scipy.linalg.solve_triangular(root, half.T, lower=True)
-    return root @ _positive_part(0.5 * (whole + whole.T)) @ root.T
-
-
-@jax.custom_jvp
-def _positive_part(x: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    values, vectors = jnp.linalg.eigh(x)
-    return (vectors * jnp.maximum(values, 0)[None, :]) @ vectors.T
-
-
-@_positive_part.defjvp
-def _positive_part_jvp(primals, tangents):
-    # The derivative of a matrix function by divided differences (Daleckii and Krein):
-    # bounded where eigenvalues meet, unlike the derivatives of the eigenvectors.
-    (x,), (dx,) = primals, tangents
-    values, vectors = jnp.linalg.eigh(x)
-    positive = jnp.maximum(values, 0)
-    rows, columns = values[:, None], values[None, :]
-    mixed = (rows > 0) != (columns > 0)
-    quotient = (positive[:, None] - positive[None, :]) / jnp.where(mixed, rows - columns, 1)
-    factor = jnp.where(mixed, quotient, (rows > 0).astype(x.dtype))
-    inner = factor * (vectors.T @ dx @ vectors)
-    value = (vectors * positive[None, :]) @ vectors.T
-    return value, vectors @ inner @ vectors.T

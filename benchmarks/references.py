@@ -1,0 +1,158 @@
+"""Independent solutions: explicit Runge-Kutta in minimal coordinates, without JAX.
+
+Every equation here is written down afresh from the mechanics, so that no mistake can be
+shared with the library: no constraints, no multipliers, no discrete derivatives.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+try:
+    from scipy.integrate import solve_ivp
+except ImportError as error:
+    raise SystemExit(
+        "The references need scipy, which is part of the extra `test`: "
+        'python -m pip install "enerjax[test]"'
+    ) from error
+
+
+Vector = NDArray[np.float64]
+Args = dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Minimal:
+    """A mechanism in minimal coordinates: `rates(y, args)`, and `y` as `(q, v)`."""
+
+    start: Callable[[Args], Vector]
+    rates: Callable[[Vector, Args], Vector]
+    as_state: Callable[[Vector, Args], tuple[Vector, Vector]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Reference:
+    """The end of the motion, and how far it changes with a tenfold tolerance."""
+
+    q: Vector
+    v: Vector
+    uncertainty_q: float
+    uncertainty_v: float
+
+
+def solve(mechanism: Minimal, args: Args, end_time: float) -> Reference:
+    """The state at `end_time`, by DOP853 at a relative tolerance of 1e-13."""
+    args = {name: np.asarray(value, np.float64) for name, value in args.items()}
+    ends = []
+    for tolerance in (1e-13, 1e-12):
+        solution = solve_ivp(
+            lambda _, y: mechanism.rates(y, args),
+            (0.0, end_time),
+            mechanism.start(args),
+            method="DOP853",
+            rtol=tolerance,
+            atol=tolerance / 10,
+        )
+        if not solution.success:
+            raise RuntimeError(f"The reference failed: {solution.message}")
+        ends.append(mechanism.as_state(solution.y[:, -1], args))
+    (q, v), (rough_q, rough_v) = ends
+    return Reference(q, v, np.abs(q - rough_q).max(), np.abs(v - rough_v).max())
+
+
+# Pendulums: angles from the direction of gravity, which is +y ---------------------------
+
+
+def _swing(y: Vector, args: Args) -> Vector:
+    return np.array([y[1], -args["g"] / args["l"] * math.sin(y[0])])
+
+
+def _horizontal(args: Args) -> Vector:
+    return np.array([math.pi / 2, 0.0])
+
+
+def _end_of_rod(angle: float, rate: float, length: float) -> tuple[Vector, Vector]:
+    sine, cosine = math.sin(angle), math.cos(angle)
+    return length * np.array([sine, cosine]), length * rate * np.array([cosine, -sine])
+
+
+def _double_swing(y: Vector, args: Args) -> Vector:
+    """`A(angles) accelerations = b(angles, rates)` of two points on two rods."""
+    m1, m2, l1, l2, g = (args[name] for name in ("m1", "m2", "l1", "l2", "g"))
+    angle1, angle2, rate1, rate2 = y
+    coupling = m2 * l1 * l2 * math.cos(angle1 - angle2)
+    twist = m2 * l1 * l2 * math.sin(angle1 - angle2)
+    inertia = np.array([[(m1 + m2) * l1**2, coupling], [coupling, m2 * l2**2]])
+    torque = np.array(
+        [
+            -twist * rate2**2 - (m1 + m2) * g * l1 * math.sin(angle1),
+            twist * rate1**2 - m2 * g * l2 * math.sin(angle2),
+        ]
+    )
+    return np.array([rate1, rate2, *np.linalg.solve(inertia, torque)])
+
+
+def _double_state(y: Vector, args: Args) -> tuple[Vector, Vector]:
+    x1, v1 = _end_of_rod(y[0], y[2], args["l1"])
+    x2, v2 = _end_of_rod(y[1], y[3], args["l2"])
+    return np.concatenate([x1, x1 + x2]), np.concatenate([v1, v1 + v2])
+
+
+def _spring(y: Vector, args: Args) -> Vector:
+    q, v = y[:2], y[2:]
+    length = math.hypot(*q)
+    force = -args["k"] * (length - args["l"]) / length * q
+    force[1] += args["m"] * args["g"]
+    return np.concatenate([v, force / args["m"]])
+
+
+# The heavy top about its fixed point: a quaternion and the body's angular velocity ------
+
+
+def _rotation(p: Vector) -> Vector:
+    """`v + 2 e0 e x v + 2 e x (e x v)`, as a matrix."""
+    x, y, z = p[1:]
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + 2 * p[0] * cross + 2 * cross @ cross
+
+
+def _top(y: Vector, args: Args) -> Vector:
+    p, spin = y[:4], y[4:]
+    m, centre = args["m"], args["centre"]
+    about_tip = np.diag(args["J"]) + m * (
+        centre @ centre * np.eye(3) - np.outer(centre, centre)
+    )
+    weight = _rotation(p).T @ np.array([0.0, 0.0, -m * args["g"]])
+    torque = np.cross(centre, weight) - np.cross(spin, about_tip @ spin)
+    turn = 0.5 * np.array(
+        [-p[1:] @ spin, *(p[0] * spin + np.cross(p[1:], spin))]
+    )
+    return np.concatenate([turn, np.linalg.solve(about_tip, torque)])
+
+
+def _top_state(y: Vector, args: Args) -> tuple[Vector, Vector]:
+    p, spin, rotation = y[:4], y[4:], _rotation(y[:4])
+    x, xdot = rotation @ args["centre"], rotation @ np.cross(spin, args["centre"])
+    return np.concatenate([x, p]), np.concatenate([xdot, spin])
+
+
+PENDULUM_ANGLE = Minimal(_horizontal, _swing, lambda y, args: (y[:1], y[1:]))
+PENDULUM = Minimal(
+    _horizontal, _swing, lambda y, args: _end_of_rod(y[0], y[1], args["l"])
+)
+DOUBLE_PENDULUM = Minimal(
+    lambda args: np.array([math.pi / 2, 0.0, 0.0, 0.0]), _double_swing, _double_state
+)
+SPRING_PENDULUM = Minimal(
+    lambda args: np.array([args["l"], 0.0, 0.0, 0.0]),
+    _spring,
+    lambda y, args: (y[:2], y[2:]),
+)
+HEAVY_TOP = Minimal(
+    lambda args: np.array([1.0, 0.0, 0.0, 0.0, 0.0, 150.0, -4.61538]), _top, _top_state
+)

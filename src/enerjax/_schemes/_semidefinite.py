@@ -1,0 +1,37 @@
+"""The positive semidefinite part of a stiffness, with derivatives that always exist."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def semidefinite_part(
+    stiffness: Float[Array, "nq nq"], inertia: Float[Array, "nq nq"]
+) -> Float[Array, "nq nq"]:
+    """Positive semidefinite part in the metric of the inertia: independent of units."""
+    root = jnp.linalg.cholesky(inertia)
+    half = jax.scipy.linalg.solve_triangular(root, stiffness, lower=True)
+    whole = jax.scipy.linalg.solve_triangular(root, half.T, lower=True)
+    return root @ _positive_part(0.5 * (whole + whole.T)) @ root.T
+
+
+@jax.custom_jvp
+def _positive_part(x: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    values, vectors = jnp.linalg.eigh(x)
+    return (vectors * jnp.maximum(values, 0)[None, :]) @ vectors.T
+
+
+@_positive_part.defjvp
+def _positive_part_jvp(primals, tangents):
+    # The derivative of a matrix function by divided differences (Daleckii and Krein):
+    # bounded where eigenvalues meet, unlike the derivatives of the eigenvectors.
+    (x,), (dx,) = primals, tangents
+    values, vectors = jnp.linalg.eigh(x)
+    positive = jnp.maximum(values, 0)
+    rows, columns = values[:, None], values[None, :]
+    mixed = (rows > 0) != (columns > 0)
+    quotient = (positive[:, None] - positive[None, :]) / jnp.where(mixed, rows - columns, 1)
+    factor = jnp.where(mixed, quotient, (rows > 0).astype(x.dtype))
+    inner = factor * (vectors.T @ dx @ vectors)
+    value = (vectors * positive[None, :]) @ vectors.T
+    return value, vectors @ inner @ vectors.T

@@ -1,0 +1,16 @@
+"""The paper's test cases and benchmark mechanisms, as `(system, start, args)`.
+
+Each function builds a `Problem`; calls with other numbers share one compiled program.
+Units are SI. In the plane gravity acts along +y; in space along -z.
+"""
+
+from ._base import Problem as Problem
+from ._pendulums import (
+    chain as chain,
+    double_pendulum as double_pendulum,
+    pendulum as pendulum,
+    pendulum_angle as pendulum_angle,
+    stiff_double_pendulum as stiff_double_pendulum,
+)
+from ._rigid_bodies import free_rigid_body as free_rigid_body, heavy_top as heavy_top
+from ._springs import four_particles as four_particles, spring_pendulum as spring_pendulum

@@ -1,0 +1,20 @@
+from typing import NamedTuple
+
+from .._initial import initial_state
+from .._system import State, System
+from .._types import Args, Vector
+
+
+class Problem(NamedTuple):
+    """A system, a consistent start and its arguments.
+
+    Use as `system, start, args = pendulum()`.
+    """
+
+    system: System
+    start: State
+    args: Args
+
+
+def problem(system: System, q: Vector, v: Vector, args: Args) -> Problem:
+    return Problem(system, initial_state(system, q, v, args), args)

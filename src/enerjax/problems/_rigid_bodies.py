@@ -1,0 +1,97 @@
+"""Rigid bodies in Euler parameters, scalar first, rotating body axes into space."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._system import System
+from .._types import Args, Coordinates, Multipliers, Scalar, Velocities
+from ._base import Problem, problem
+
+
+def _rotation(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
+    """The rotation matrix, quadratic in `p` (orthogonal where `|p| = 1`)."""
+    scalar, vector = p[0], p[1:]
+    x, y, z = vector
+    cross = jnp.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    isotropic = (scalar**2 - vector @ vector) * jnp.eye(3, dtype=p.dtype)
+    return isotropic + 2 * (jnp.outer(vector, vector) + scalar * cross)
+
+
+def _body_rates(p: Float[Array, "4"]) -> Float[Array, "3 4"]:
+    """`2 E(p)` in `Omega = 2 E(p) pdot`, the angular velocity in body axes."""
+    e0, e1, e2, e3 = p
+    return 2 * jnp.array([[-e1, e0, e3, -e2], [-e2, -e3, e0, e1], [-e3, e2, -e1, e0]])
+
+
+def _unit(q: Coordinates, args: Args) -> Multipliers:
+    return jnp.array([q[-4:] @ q[-4:] - 1])
+
+
+def _spin_kinetic(v: Velocities, args: Args) -> Scalar:
+    return 0.5 * v @ (args["J"] * v)
+
+
+def _no_potential(q: Coordinates, args: Args) -> Scalar:
+    return jnp.zeros((), q.dtype)
+
+
+def _spin_rates(q: Coordinates, args: Args) -> Float[Array, "3 4"]:
+    return _body_rates(q)
+
+
+def free_rigid_body() -> Problem:
+    """An asymmetric body that turns freely about its mass centre.
+
+    `q` is the unit quaternion, `v` the angular velocity in body axes. The kinetic energy
+    is 2500, the angular momentum in space (60, 160, 60).
+
+    **Source:** P. L. Kinon and P. Betsch, Multibody Syst. Dyn. (2024).
+    """
+    args = dict(J=jnp.array([6.0, 8.0, 3.0]))
+    system = System(
+        _spin_kinetic, _no_potential, kinematics=_spin_rates, coordinate_constraint=_unit
+    )
+    return problem(system, [1.0, 0, 0, 0], [10.0, 20, 20], args)
+
+
+def _top_kinetic(v: Velocities, args: Args) -> Scalar:
+    return 0.5 * (args["m"] * v[:3] @ v[:3] + v[3:] @ (args["J"] * v[3:]))
+
+
+def _top_potential(q: Coordinates, args: Args) -> Scalar:
+    return args["m"] * args["g"] * q[2]
+
+
+def _top_joint(q: Coordinates, args: Args) -> Multipliers:
+    return q[:3] - _rotation(q[3:]) @ args["centre"]
+
+
+def _top_rates(q: Coordinates, args: Args) -> Float[Array, "6 7"]:
+    eye = jnp.eye(3, dtype=q.dtype)
+    off = jnp.zeros((3, 4), q.dtype)
+    return jnp.block([[eye, off], [off[:, :3], _body_rates(q[3:])]])
+
+
+def heavy_top() -> Problem:
+    """A fast heavy top on a spherical joint at the origin.
+
+    `q = (x, p)`: mass centre and unit quaternion; `v = (xdot, Omega)`, the angular
+    velocity in body axes. The multipliers of the joint are minus the force on the top.
+
+    **Source:** O. Bruls, A. Cardona and M. Arnold, Mech. Mach. Theory 48 (2012) 121-137.
+    """
+    args = dict(
+        m=15.0,
+        g=9.81,
+        J=jnp.array([0.234375, 0.46875, 0.234375]),
+        centre=jnp.array([0.0, 1.0, 0.0]),
+    )
+    system = System(
+        _top_kinetic,
+        _top_potential,
+        _top_joint,
+        kinematics=_top_rates,
+        coordinate_constraint=_unit,
+    )
+    spin = [0.0, 150.0, -4.61538]
+    return problem(system, [0.0, 1, 0, 1, 0, 0, 0], [4.61538, 0.0, 0.0, *spin], args)
