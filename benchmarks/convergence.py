@@ -3,7 +3,6 @@
 import dataclasses
 import math
 from collections.abc import Callable, Iterator
-from concurrent.futures import as_completed, ThreadPoolExecutor
 
 import numpy as np
 import references
@@ -12,23 +11,34 @@ from references import Minimal, Reference
 import enerjax as ej
 
 
+# Errors are the largest at these parts of a run: the end alone can be a lucky moment,
+# where the leading errors of two steps have different signs.
+CHECKPOINTS = np.array([0.25, 0.5, 0.75, 1.0])
+
+
 @dataclasses.dataclass(frozen=True)
 class Case:
     """A problem, how long it runs, and in how many steps at the coarsest.
 
-    `coarsest` is by the order of the scheme: a high order needs long steps to stay above
-    round-off over two halvings, a low order short ones to be in its asymptotic regime.
+    `coarsest` is by the kind of scheme: high orders need long steps to stay above
+    round-off over two halvings, low orders short ones to show what they tend to.
     """
 
     name: str
     problem: Callable[[], ej.problems.Problem]
     minimal: Minimal
     end_time: float
-    coarsest: dict[int, int]
+    coarsest: dict[str, int]
     energy_scale: float
     energy_scale_name: str
     constrained: bool = True
+    # Whether V or Phi is more than quadratic in more than one coordinate.
+    curved: bool = False
     kinematics: bool = False
+
+    @property
+    def times(self) -> np.ndarray:
+        return self.end_time * CHECKPOINTS
 
 
 CASES = (
@@ -37,27 +47,31 @@ CASES = (
         ej.problems.spring_pendulum,
         references.SPRING_PENDULUM,
         2.0,
-        {2: 100, 3: 100, 4: 50, 6: 25, 8: 20},
+        {"EP": 100, "ED": 400, "ED MeanValue": 100, "EC0": 48, "EC": 100}
+        | {"EP4": 48, "EP6": 32, "EP8": 16, "EC6": 24, "EC8": 8},
         9.81,
         "m g l",
         constrained=False,
+        curved=True,
     ),
     Case(
-        "pendulum, angle",
+        "pendulum in its angle",
         ej.problems.pendulum_angle,
         references.PENDULUM_ANGLE,
         2.0,
-        {2: 50, 3: 50, 4: 25, 6: 12, 8: 8},
+        {"EP": 100, "ED": 100, "EC0": 24, "EC": 48}
+        | {"EP4": 24, "EP6": 12, "EP8": 8, "EC6": 8, "EC8": 4},
         9.81,
         "m g l",
         constrained=False,
     ),
     Case(
-        "pendulum",
+        "pendulum in x, y",
         ej.problems.pendulum,
         references.PENDULUM,
         2.0,
-        {2: 100, 3: 50, 4: 25, 6: 12, 8: 8},
+        {"EP": 100, "ED": 400, "kappa": 100, "EC0": 24, "EC": 100}
+        | {"EP4": 24, "EP6": 16, "EP8": 12, "EC6": 12, "EC8": 8},
         9.81,
         "m g l",
     ),
@@ -66,17 +80,18 @@ CASES = (
         ej.problems.double_pendulum,
         references.DOUBLE_PENDULUM,
         2.0,
-        {2: 200, 3: 100, 4: 50, 6: 30, 8: 24},
-        2 * 9.81 + 9.81,
-        "g (m1 l1 + m2 (l1 + l2))",
+        {"EP": 200, "ED": 800, "kappa": 200, "EC0": 48, "EC": 100}
+        | {"EP4": 48, "EP6": 40, "EP8": 24, "EC6": 32, "EC8": 16},
+        29.43,
+        "m1 g l1 + m2 g (l1 + l2)",
     ),
     Case(
         "heavy top",
         ej.problems.heavy_top,
         references.HEAVY_TOP,
         0.2,
-        {2: 100, 4: 50, 6: 30, 8: 25},
-        5436.0,
+        {"EP": 100, "ED": 400, "kappa": 100, "EP4": 48, "EP6": 32, "EP8": 20},
+        5432.3,
         "kinetic energy at the start",
         kinematics=True,
     ),
@@ -86,9 +101,10 @@ QUICK_CASES = ("spring pendulum", "double pendulum")
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """A scheme as the table names it, and the order that theory gives it."""
+    """A scheme as the table names it, its kind, and the order that theory gives it."""
 
     name: str
+    kind: str
     scheme: ej.AbstractScheme
     expected: int
 
@@ -96,47 +112,70 @@ class Method:
 def methods(case: Case) -> Iterator[list[Method]]:
     """The schemes that are defined on a problem; those of a group share one program.
 
-    Each scheme is listed once. Without constraints the two formulations are one, and so
-    are `KappaDecaying` and `EnergyDecaying`; the two discrete gradients differ only
-    where V or Phi is more than quadratic in more than one coordinate.
+    Each is listed once. Without constraints the two formulations are one scheme, and so
+    are `KappaDecaying` and `EnergyDecaying`; the discrete gradients differ only where
+    the problem is `curved`.
     """
-    preserving = "EnergyPreserving"
-    yield [Method(preserving, ej.EnergyPreserving(), 2)]
+    mean = ej.MeanValue()
+    yield [Method("EnergyPreserving()", "EP", ej.EnergyPreserving(), 2)]
     if case.constrained:
-        yield [Method(f"{preserving} index3", ej.EnergyPreserving("index3"), 2)]
-    free = 2 if case.constrained or case.name == "spring pendulum" else 3
+        scheme = ej.EnergyPreserving("index3")
+        yield [Method('EnergyPreserving("index3")', "EP", scheme, 2)]
+    order = 2 if case.constrained or case.curved else 3
     yield [
-        Method(f"EnergyDecaying({a})", ej.EnergyDecaying(a), free) for a in (0.5, 1.0)
+        Method(f"EnergyDecaying({a})", "ED", ej.EnergyDecaying(a), order)
+        for a in (0.5, 1.0)
     ]
+    if case.curved:
+        yield [
+            Method(
+                f"EnergyDecaying({a}, MeanValue())",
+                "ED MeanValue",
+                ej.EnergyDecaying(a, derivative=mean),
+                3,
+            )
+            for a in (0.5, 1.0)
+        ]
     if case.constrained:
+        # Its velocities do not satisfy the constraints, to first order in h.
         yield [
-            Method(f"EnergyDecaying({a}) index3", ej.EnergyDecaying(a, "index3"), 2)
+            Method(
+                f'EnergyDecaying({a}, "index3")', "ED", ej.EnergyDecaying(a, "index3"), 1
+            )
             for a in (0.5, 1.0)
         ]
-        yield [Method("KappaDecaying(0.5)", ej.KappaDecaying(0.5), 2)]
-    if case.name == "spring pendulum":
-        mean = ej.MeanValue()
-        yield [
-            Method(f"EnergyDecaying({a}) MeanValue", ej.EnergyDecaying(a, derivative=mean), 3)
-            for a in (0.5, 1.0)
-        ]
+        yield [Method("KappaDecaying(0.5)", "kappa", ej.KappaDecaying(0.5), 2)]
     if not case.kinematics:
         yield [
-            Method(f"EnergyConsistent({a})", ej.EnergyConsistent(a), 3 if a else 4)
+            Method(
+                f"EnergyConsistent({a})",
+                "EC" if a else "EC0",
+                ej.EnergyConsistent(a),
+                3 if a else 4,
+            )
             for a in (0.0, 0.5, 1.0)
         ]
     for order in (4, 6, 8):
+        name, kind = "Composed(EnergyPreserving({}), {})", f"EP{order}"
         scheme = ej.Composed(ej.EnergyPreserving(), order)
-        yield [Method(f"Composed({preserving}, {order})", scheme, order)]
+        yield [Method(name.format("", order), kind, scheme, order)]
+        if case.curved:
+            scheme = ej.Composed(ej.EnergyPreserving(derivative=mean), order)
+            yield [Method(name.format("MeanValue()", order), kind, scheme, order)]
     if not case.kinematics:
         for order in (6, 8):
             scheme = ej.Composed(ej.EnergyConsistent(0.0), order)
-            yield [Method(f"Composed(EnergyConsistent(0), {order})", scheme, order)]
+            name = f"Composed(EnergyConsistent(0.0), {order})"
+            yield [Method(name, f"EC{order}", scheme, order)]
 
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """One run to the end time; the errors are NaN if it failed on the way."""
+    """One run to the end time; the errors are NaN if it failed on the way.
+
+    Energies are relative to the scale of the case. `identity_error` is that of the
+    scheme's own balance: the energy plus all that the scheme says it removed.
+    """
 
     h: float
     error_q: float
@@ -145,7 +184,7 @@ class Run:
     identity_error: float
     constraint: float
     constraint_rate: float
-    newton_iterations: float
+    newton_iterations: float  # mean, of one solve
     failure: str
 
 
@@ -161,46 +200,57 @@ def run(
     It is done in as many calls of the same number of steps. `h` and the start are
     traced, so all steps of a scheme share one compilation.
     """
-    num_steps = case.coarsest[method.expected]
+    num_steps = case.coarsest[method.kind]
     h = case.end_time / (num_steps * blocks)
     system, state, args = problem
     energy0, removed, failure = float(system.energy(state, args)), 0.0, ""
-    energy_error = identity_error = constraint = rate = 0.0
-    iterations = []
+    names = ("q", "v", "change", "identity", "constraint", "rate", "iterations")
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for block in range(blocks):
         solution = ej.simulate(
             system, method.scheme, state, args, h=h, num_steps=num_steps, throw=False
         )
         done = int(solution.stats.completed_steps)
-        audit = solution.audit
-        change = np.asarray(audit.energy)[: done + 1] - energy0
-        dissipated = removed + np.cumsum(audit.dissipated)[: done + 1]
-        removed = dissipated[-1]
-        energy_error = max(energy_error, _largest(change))
-        identity_error = max(identity_error, _largest(change + dissipated))
-        constraint = max(constraint, _largest(audit.constraint[: done + 1]))
-        rate = max(rate, _largest(audit.constraint_rate[: done + 1]))
-        iterations.append(np.asarray(solution.stats.newton_iterations)[:done])
+        audit, rows = solution.audit, slice(1, done + 1)
+        change = np.asarray(audit.energy)[rows] - energy0
+        dissipated = removed + np.cumsum(audit.dissipated)[rows]
+        parts["q"].append(np.asarray(solution.ys.q)[rows])
+        parts["v"].append(np.asarray(solution.ys.v)[rows])
+        parts["change"].append(change / case.energy_scale)
+        parts["identity"].append((change + dissipated) / case.energy_scale)
+        parts["constraint"].append(np.asarray(audit.constraint)[rows])
+        parts["rate"].append(np.asarray(audit.constraint_rate)[rows])
+        parts["iterations"].append(np.asarray(solution.stats.newton_iterations)[:done])
         if done < num_steps:
             cause = ej.RESULTS[solution.result].split(".")[0].split(":")[0]
-            failure = f"t = {(block * num_steps + done) * h:.4g}: {cause}"
+            failure = f"failed at t = {(block * num_steps + done) * h:.4g}: {cause}"
             break
+        removed = dissipated[-1]
         state = ej.State(solution.ys.q[-1], solution.ys.v[-1])
-    error_q = math.nan if failure else _largest(state.q - reference.q)
-    error_v = math.nan if failure else _largest(state.v - reference.v)
-    solves = np.concatenate(iterations) / len(method.scheme.stages)
+    whole = {name: np.concatenate(part) for name, part in parts.items()}
+    error_q = error_v = math.nan
+    if not failure:
+        at = np.rint(num_steps * blocks * CHECKPOINTS).astype(int) - 1
+        error_q = _largest(whole["q"][at] - reference.q)
+        error_v = _largest(whole["v"][at] - reference.v)
     return Run(
         h,
         error_q,
         error_v,
-        energy_error / case.energy_scale,
-        identity_error / case.energy_scale,
-        constraint,
-        rate,
-        float(solves.mean()) if solves.size else math.nan,
+        *(_largest(whole[name]) for name in ("change", "identity", "constraint", "rate")),
+        float(np.mean(whole["iterations"])) / len(method.scheme.stages),
         failure,
     )
 
 
-def _largest(x) -> float:
-    return float(np.abs(np.asarray(x)).max(initial=0.0))
+def _largest(x: np.ndarray) -> float:
+    return float(np.abs(x).max(initial=0.0))
+
+
+def slopes(runs: list[Run], error: str, floor: float) -> list[float]:
+    """Slopes over the halvings above `floor`, from the coarsest; none if a run failed."""
+    if any(run.failure for run in runs):
+        return []
+    errors = [getattr(run, error) for run in runs]
+    pairs = zip(errors[:-1], errors[1:], strict=True)
+    return [math.log2(a / b) for a, b in pairs if min(a, b) > floor]

@@ -37,7 +37,7 @@ class Minimal:
 
 @dataclasses.dataclass(frozen=True)
 class Reference:
-    """The end of the motion, and how far it changes with a tenfold tolerance."""
+    """The motion at some times, and how far it changes with a tenfold tolerance."""
 
     q: Vector
     v: Vector
@@ -45,24 +45,35 @@ class Reference:
     uncertainty_v: float
 
 
-def solve(mechanism: Minimal, args: Args, end_time: float) -> Reference:
-    """The state at `end_time`, by DOP853 at a relative tolerance of 1e-13."""
+def solve(mechanism: Minimal, args: Args, times: Vector) -> Reference:
+    """The states at `times`, by DOP853 at a relative tolerance of 1e-13."""
     args = {name: np.asarray(value, np.float64) for name, value in args.items()}
-    ends = []
-    for tolerance in (1e-13, 1e-12):
+    (q, v), (rough_q, rough_v) = (
+        _states(mechanism, args, times, tolerance) for tolerance in (1e-13, 1e-12)
+    )
+    return Reference(q, v, np.abs(q - rough_q).max(), np.abs(v - rough_v).max())
+
+
+def _states(
+    mechanism: Minimal, args: Args, times: Vector, tolerance: float
+) -> tuple[Vector, Vector]:
+    now, y, states = 0.0, mechanism.start(args), []
+    # From one time to the next: the interpolant between steps is less accurate.
+    for time in times:
         solution = solve_ivp(
             lambda _, y: mechanism.rates(y, args),
-            (0.0, end_time),
-            mechanism.start(args),
+            (now, time),
+            y,
             method="DOP853",
             rtol=tolerance,
             atol=tolerance / 10,
         )
         if not solution.success:
             raise RuntimeError(f"The reference failed: {solution.message}")
-        ends.append(mechanism.as_state(solution.y[:, -1], args))
-    (q, v), (rough_q, rough_v) = ends
-    return Reference(q, v, np.abs(q - rough_q).max(), np.abs(v - rough_v).max())
+        now, y = time, solution.y[:, -1]
+        states.append(mechanism.as_state(y, args))
+    q, v = zip(*states, strict=True)
+    return np.array(q), np.array(v)
 
 
 # Pendulums: angles from the direction of gravity, which is +y ---------------------------
@@ -129,9 +140,7 @@ def _top(y: Vector, args: Args) -> Vector:
     )
     weight = _rotation(p).T @ np.array([0.0, 0.0, -m * args["g"]])
     torque = np.cross(centre, weight) - np.cross(spin, about_tip @ spin)
-    turn = 0.5 * np.array(
-        [-p[1:] @ spin, *(p[0] * spin + np.cross(p[1:], spin))]
-    )
+    turn = 0.5 * np.array([-p[1:] @ spin, *(p[0] * spin + np.cross(p[1:], spin))])
     return np.concatenate([turn, np.linalg.solve(about_tip, torque)])
 
 

@@ -1,17 +1,19 @@
 """Consistent starts: positions, velocities, accelerations and multipliers."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optimistix as optx
 from jaxtyping import Array, Float
 
 from ._check import check_system
 from ._model import Model
 from ._newton import find_root, Newton
-from ._results import from_root_finder, RESULTS
 from ._system import State, System
 from ._tracing import is_known
-from ._types import Args, Coordinates, Flag, Multipliers, Vector, Velocities
+from ._types import Args, Coordinates, Count, Flag, Multipliers, Vector, Velocities
 
 
 class ConsistentStart(eqx.Module):
@@ -65,33 +67,48 @@ def consistent_start(
 
     **Raises:** `ValueError` for a start that is too far away, with the residual, and for
     bad input as `simulate`. Under `jit`, `vmap` and `grad` a start too far away raises
-    `equinox.EquinoxRuntimeError` at run time.
+    `equinox.EquinoxRuntimeError` at run time. The same for constraints that are not
+    independent at the start, with their rank.
     """
     state, args = check_system(system, State(q, v), args)
-    start, repairable, result = _project(system, state, args)
-    bad = ~repairable | (result != RESULTS.successful)
-    message = (
+    start, near, rank = _project(system, state, args)
+    start = _raise_unless(
+        near,
+        start,
         "The start is too far from the constraints to be repaired: their linearisation "
         "does not explain the error, so the nearest admissible configuration may not be "
-        "the one that was meant. Check the start against lengths and anchors in `args`; "
-        "constraints that repeat each other fail in the same way."
+        "the one that was meant. Check it against the lengths and anchors in `args`.",
+        lambda: f"Residual of the constraints: {start.constraint_before}.",
     )
-    if not is_known((bad, start)):
-        return eqx.error_if(start, bad, message)
-    if bad:
-        raise ValueError(
-            f"{message} Residual of the constraints: {start.constraint_before}."
-        )
+    num_constraints = start.multipliers.size
+    return _raise_unless(
+        rank == num_constraints,
+        start,
+        "The constraints do not determine their multipliers at the start: some repeat "
+        "each other, or do not depend on `q` there (a square of a distance?). Leave out "
+        "those that follow from the others.",
+        lambda: f"Their Jacobian has rank {rank}, of {num_constraints} rows.",
+    )
+
+
+def _raise_unless(
+    good: Flag, start: ConsistentStart, message: str, figures: Callable[[], str]
+) -> ConsistentStart:
+    """Raises with the figures where they are known, else without and at run time."""
+    if not is_known((good, start)):
+        return eqx.error_if(start, ~good, message)
+    if not good:
+        raise ValueError(f"{message} {figures()}")
     return start
 
 
 @eqx.filter_jit
 def _project(
     system: System, guess: State, args: Args
-) -> tuple[ConsistentStart, Flag, RESULTS]:
+) -> tuple[ConsistentStart, Flag, Count]:
     model = Model(system, guess, args)
     before = model.constraint(guess.q)
-    q, repairable, result = _project_position(model, guess.q)
+    q, near = _project_position(model, guess.q)
     v = _project_velocity(model, q, guess.v)
     state = State(q, v)
     acceleration, multipliers = model.accelerations(state)
@@ -104,15 +121,15 @@ def _project(
         model.joint_rate(q, guess.v),
         model.joint_rate(q, v),
     )
-    finite = jnp.all(jnp.isfinite(acceleration)) & jnp.all(jnp.isfinite(multipliers))
-    return start, repairable & finite, result
+    jacobian = jax.lax.stop_gradient(model.constraint_jacobian(q))
+    unit = jacobian / model.scales.coordinate[None, :] / model.scales.constraint[:, None]
+    return start, near, jnp.linalg.matrix_rank(unit)
 
 
-def _project_position(
-    model: Model, guess: Coordinates
-) -> tuple[Coordinates, Flag, RESULTS]:
+def _project_position(model: Model, guess: Coordinates) -> tuple[Coordinates, Flag]:
+    """The nearest configuration on the constraints, and whether it could be found."""
     if model.constraint(guess).size == 0:
-        return guess, jnp.array(True), RESULTS.successful
+        return guess, jnp.array(True)
     metric, scales = model.metric(guess), model.scales
     size = jnp.max(jnp.abs(guess) * scales.coordinate)
     size = jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
@@ -127,11 +144,16 @@ def _project_position(
         return force / (size * scales.coordinate), constraint / rows
 
     zero = (jnp.zeros_like(guess), jnp.zeros_like(scales.constraint))
+    tolerance = 1e2 * jnp.finfo(guess.dtype).eps
     x, _, result = find_root(
         conditions, Newton(), zero, (model, metric, guess), max_iterations=50
     )
-    shift = size * x[0] / scales.coordinate
-    return guess + shift, _linear(model, metric, guess), from_root_finder(result)
+    found = result == optx.RESULTS.successful
+    # Constraints that are met are not far; whether they are independent is told apart.
+    met = jnp.max(jnp.abs(conditions(zero, (model, metric, guess))[1])) <= tolerance
+    near = met | (found & _linear(model, metric, guess))
+    q = jnp.where(met & ~found, guess, guess + size * x[0] / scales.coordinate)
+    return q, near
 
 
 def _linear(model: Model, metric: Float[Array, "nq nq"], q: Coordinates) -> Flag:
@@ -149,9 +171,7 @@ def _linear(model: Model, metric: Float[Array, "nq nq"], q: Coordinates) -> Flag
     first = correction(model.constraint(q))
     second = correction(model.constraint(q - first))
     length = lambda x: jnp.sqrt(x @ metric @ x)
-    # Nothing to explain where the error is round-off.
-    tiny = 1e3 * jnp.finfo(q.dtype).eps * (1e-3 + length(q))
-    return (length(second) <= 0.25 * length(first)) | (length(first) <= tiny)
+    return length(second) <= 0.25 * length(first)
 
 
 def _project_velocity(model: Model, q: Coordinates, v: Velocities) -> Velocities:

@@ -85,7 +85,9 @@ class Newton(optx.AbstractRootFinder):
         )
         eps = jnp.finfo(size.dtype).eps
         quadratic = (contraction < 0.1) & (predicted <= self.rtol * eps)
-        done = quadratic | (residual <= self.atol * eps)
+        # A singular Jacobian leaves the correction without a value, however small the
+        # residual is: that is no solution, and shows in the next iterate.
+        done = (quadratic | (residual <= self.atol * eps)) & jnp.isfinite(size)
         count, flat = state.count + 1, flat - correction
         if options.get("second_guess") is not None:
             lost = ~jnp.isfinite(size) | (count == _PATIENCE)

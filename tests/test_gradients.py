@@ -1,0 +1,186 @@
+"""Derivatives of a run: forward, reverse and by differences, with respect to everything."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import enerjax as ej
+
+from .helpers import problem, SCHEMES
+
+
+STEPS = 100
+PENDULUM = problem("pendulum").system
+# g, l, m, h, alpha, and a start that is off the rod and off the velocity level.
+PARAMETERS = dict(
+    g=9.81, l=1.0, m=1.3, h=0.02, alpha=0.5, q=np.array([0.95, 0.1]), v=np.array([0.0, 0.2])
+)
+
+
+def start_of(p):
+    args = dict(g=p["g"], l=p["l"], m=p["m"])
+    return ej.initial_state(PENDULUM, p["q"], p["v"], args), args
+
+
+def end(p, make):
+    """x(2 s), with the start projected inside: it moves along the constraints."""
+    start, args = start_of(p)
+    solution = ej.simulate(
+        PENDULUM, make(p["alpha"]), start, args, h=p["h"], num_steps=STEPS, throw=False
+    )
+    return solution.ys.q[-1, 0]
+
+
+def parameters(**changes):
+    return jax.tree.map(jnp.asarray, PARAMETERS | changes)
+
+
+def by_differences(fn, p):
+    """Central differences of fourth order; their error is round-off / step ~ 1e-10."""
+    flat, unravel = jax.flatten_util.ravel_pytree(p)
+    delta = 1e-4 * jnp.eye(flat.size)
+    points = jnp.concatenate([flat[None] + c * delta for c in (-2, -1, 1, 2)])
+    values = jax.jit(jax.vmap(lambda x: fn(unravel(x))))(points).reshape(4, -1)
+    return jnp.array([1.0, -8.0, 8.0, -1.0]) @ values / 12e-4
+
+
+# Everything that converges on the pendulum. The composed schemes have no alpha to move.
+CONVERGING = [
+    "preserving",
+    "preserving index3",
+    "decaying",
+    "decaying index3",
+    "kappa",
+    "consistent",
+    "composed 4",
+]
+
+
+@pytest.mark.parametrize("scheme", CONVERGING)
+def test_forward_reverse_and_differences_agree(scheme):
+    p = parameters()
+    flat = lambda tree: jax.flatten_util.ravel_pytree(tree)[0]
+    fn = lambda p: end(p, SCHEMES[scheme])
+    reverse = flat(jax.jit(jax.grad(fn))(p))
+    forward = flat(jax.jit(jax.jacfwd(fn))(p))
+    differences = by_differences(fn, p)
+    # Solver: both solve the linearised steps, to round-off times the condition.
+    np.testing.assert_allclose(forward, reverse, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(differences, reverse, rtol=1e-5, atol=1e-5)
+    # g, h and the start matter; alpha does where it appears.
+    names = dict(zip(("alpha", "g", "h", "l", "m"), np.asarray(reverse), strict=False))
+    assert abs(names["g"]) > 1e-3
+    assert abs(names["h"]) > 1e-3
+    has_alpha = not scheme.startswith(("preserving", "composed"))
+    assert (abs(names["alpha"]) > 1e-9) == has_alpha
+    # The mass drops out of the motion of a pendulum.
+    assert abs(names["m"]) <= 1e-8
+
+
+@pytest.mark.parametrize("save_every", [1, 20])
+def test_saving_less_does_not_change_the_gradient(save_every):
+    """With `save_every` the steps between are computed again in reverse mode."""
+    system, start, args = problem("pendulum")
+
+    def fn(g):
+        solution = ej.simulate(
+            system,
+            ej.EnergyPreserving(),
+            start,
+            args | dict(g=g),
+            h=0.02,
+            num_steps=STEPS,
+            save_every=save_every,
+            throw=False,
+        )
+        return solution.ys.q[-1, 0]
+
+    # x(2 s) of a pendulum depends on g t^2 alone: the derivative follows from x'(t).
+    reverse = jax.grad(fn)(9.81)
+    eps = 1e-4
+    differences = (fn(9.81 + eps) - fn(9.81 - eps)) / (2 * eps)
+    # Truncation of the difference, eps^2 x''' / 6.
+    np.testing.assert_allclose(reverse, differences, rtol=1e-6)
+
+
+def test_second_derivatives_exist():
+    fn = lambda g: end(parameters() | dict(g=g), SCHEMES["decaying"])
+    slope = jax.jit(jax.grad(fn))
+    eps = 1e-4
+    g = jnp.asarray(9.81)
+    differences = (slope(g + eps) - slope(g - eps)) / (2 * eps)
+    np.testing.assert_allclose(jax.jit(jax.hessian(fn))(g), differences, rtol=1e-5)
+
+
+def test_the_start_moves_along_the_constraints():
+    p = parameters()
+
+    def residuals(p):
+        start, args = start_of(p)
+        rod = PENDULUM.constraint(start.q, args)
+        return jnp.append(rod, start.q @ start.v)
+
+    # Round-off: the residuals vanish for every start, so their derivatives do.
+    for leaf in jax.tree.leaves(jax.jit(jax.jacrev(residuals))(p)):
+        np.testing.assert_allclose(leaf, 0, atol=1e-13)
+
+
+def test_gradients_of_a_rigid_body():
+    system, start, args = problem("body")
+
+    def fn(inertia):
+        solution = ej.simulate(
+            system,
+            ej.EnergyPreserving(),
+            start,
+            dict(J=inertia),
+            h=0.005,
+            num_steps=20,
+            throw=False,
+        )
+        return solution.ys.q[-1, 1]
+
+    direction = jnp.array([1.0, -2.0, 0.5])
+    inertia = args["J"]
+    fn = jax.jit(fn)
+    forward = jax.jit(lambda x: jax.jvp(fn, (x,), (direction,))[1])(inertia)
+    reverse = jax.jit(jax.grad(fn))(inertia) @ direction
+    eps = 1e-5
+    differences = (fn(inertia + eps * direction) - fn(inertia - eps * direction)) / (2 * eps)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-8)
+    np.testing.assert_allclose(differences, reverse, rtol=1e-5)
+
+
+def test_gradients_stay_finite_at_rest():
+    """In equilibrium every increment is zero, where a discrete gradient divides by it."""
+    system, _, args = problem("pendulum")
+
+    def fn(g, derivative):
+        args_g = args | dict(g=g)
+        start = ej.State([0.0, 1.0], [0.0, 0.0])
+        scheme = ej.EnergyPreserving(derivative=derivative)
+        solution = ej.simulate(system, scheme, start, args_g, h=0.02, num_steps=5)
+        return jnp.sum(solution.ys.q) + jnp.sum(solution.multipliers)
+
+    for derivative in (ej.Gonzalez(), ej.MeanValue()):
+        slope = jax.grad(lambda g: fn(g, derivative))(9.81)
+        # Closed form: the rod carries m g, so 2 lambda = m g in each of the six rows.
+        np.testing.assert_allclose(slope, 6 * 0.5, rtol=1e-10)
+
+
+def test_a_failed_lane_leaves_the_gradients_of_the_others_finite():
+    system, start, args = problem("pendulum")
+
+    def fn(h):
+        solution = ej.simulate(
+            system, ej.EnergyPreserving(), start, args, h=h, num_steps=10, throw=False
+        )
+        return solution.ys.q[-1, 0], solution.result == ej.RESULTS.successful
+
+    steps = jnp.array([0.01, 50.0, 0.02])
+    slope, okay = jax.jit(jax.vmap(jax.grad(fn, has_aux=True)))(steps)
+    np.testing.assert_array_equal(okay, [True, False, True])
+    assert np.all(np.isfinite(slope[np.array([0, 2])]))
+    alone, _ = jax.jit(jax.grad(fn, has_aux=True))(steps[0])
+    np.testing.assert_allclose(slope[0], alone, rtol=1e-10)

@@ -1,0 +1,156 @@
+"""Orders of accuracy, against references in other coordinates and by other methods."""
+
+import numpy as np
+import pytest
+
+import enerjax as ej
+
+from .helpers import (
+    double_pendulum_reference,
+    march,
+    pendulum_reference,
+    point_on_rod,
+    SCHEMES,
+    slopes,
+    spring_pendulum_reference,
+)
+
+
+T = 2.0
+REFERENCES = {
+    "pendulum": point_on_rod,
+    "double": double_pendulum_reference,
+    "spring": spring_pendulum_reference,
+}
+# Round-off of 1e3 steps, and of the references.
+PLATEAU = 2e-12
+# Errors above this are not yet in the range where the leading term rules.
+TOO_LARGE = 5e-2
+
+
+def errors(name, scheme, alpha, steps):
+    reference = REFERENCES[name](T)
+    ends = [march(name, scheme, alpha, h=T / n, steps=n) for n in steps]
+    return (
+        np.array([np.max(np.abs(end.q - reference.q)) for end in ends]),
+        np.array([np.max(np.abs(end.v - reference.v)) for end in ends]),
+    )
+
+
+
+
+FINE = (100, 200, 400, 800)
+COARSE = (12, 24, 48, 96)
+# name, scheme, alpha, order, allowed deviation, numbers of steps
+CASES = [
+    ("pendulum", "preserving", 0.0, 2, 0.1, FINE),
+    ("pendulum", "preserving index3", 0.0, 2, 0.1, FINE),
+    ("double", "preserving", 0.0, 2, 0.1, FINE),
+    ("spring", "preserving", 0.0, 2, 0.1, FINE),
+    ("pendulum", "decaying", 0.0, 2, 0.1, FINE),
+    ("pendulum", "decaying", 0.5, 2, 0.1, FINE),
+    ("pendulum", "decaying", 1.0, 2, 0.1, FINE),
+    ("double", "decaying", 0.0, 2, 0.1, FINE),
+    ("spring", "decaying", 0.5, 2, 0.1, FINE),
+    ("spring", "decaying gauss", 0.0, 3, 0.1, FINE),
+    ("spring", "decaying gauss", 0.5, 3, 0.1, FINE),
+    ("spring", "decaying gauss", 1.0, 3, 0.1, FINE),
+    ("pendulum", "kappa", 0.0, 2, 0.1, FINE),
+    ("pendulum", "kappa", 0.5, 2, 0.1, FINE),
+    ("pendulum", "kappa", 1.0, 2, 0.1, FINE),
+    *[(name, "consistent", 0.0, 4, 0.15, (50, 100, 200, 400)) for name in REFERENCES],
+    *[("spring", "consistent", alpha, 3, 0.15, FINE) for alpha in (0.5, 1.0)],
+    *[("double", "consistent", alpha, 3, 0.15, FINE) for alpha in (0.5, 1.0)],
+    # On the pendulum the leading error in the positions is small: finer steps.
+    *[("pendulum", "consistent", alpha, 3, 0.15, (400, 800, 1600)) for alpha in (0.5, 1.0)],
+    ("pendulum", "composed 4", 0.0, 4, 0.2, (24, 48, 96, 192)),
+    ("double", "composed 4", 0.0, 4, 0.2, (50, 100, 200, 400)),
+    ("pendulum", "composed 6", 0.0, 6, 0.2, COARSE),
+    ("double", "composed 6", 0.0, 6, 0.2, (50, 100, 200)),
+    ("pendulum", "composed 8", 0.0, 8, 0.25, (16, 24, 32, 48)),
+    ("pendulum", "consistent 6", 0.0, 6, 0.2, (8, 16, 32)),
+]
+
+
+@pytest.mark.parametrize(("name", "scheme", "alpha", "order", "deviation", "steps"), CASES)
+def test_errors_shrink_with_the_order_of_the_scheme(
+    name, scheme, alpha, order, deviation, steps
+):
+    for error in errors(name, scheme, alpha, steps):
+        usable = (error > PLATEAU) & (error < TOO_LARGE)
+        assert usable.sum() >= 3, f"too few errors between round-off and chaos: {error}"
+        n = np.array(steps)[usable]
+        e = error[usable]
+        slope = np.log(e[:-1] / e[1:]) / np.log(n[1:] / n[:-1])
+        np.testing.assert_allclose(slope[-2:], order, rtol=0, atol=deviation)
+
+
+def test_nine_stages_raise_the_fourth_order_to_eight():
+    n = np.array([8, 12, 16, 24])
+    for error in errors("pendulum", "consistent 8", 0.0, tuple(n)):
+        slope = np.log(error[0] / error[-1]) / np.log(n[-1] / n[0])
+        assert slope > 7.5
+        assert error[-1] < 1e-8
+
+
+@pytest.mark.parametrize("alpha", [0.5, 1.0])
+def test_index3_converges_more_slowly(alpha):
+    """It loses an order in the velocities: about 1.6 in q and 1 in v."""
+    q, v = errors("pendulum", "decaying index3", alpha, FINE)
+    assert np.all((slopes(q) > 1.2) & (slopes(q) < 2.0))
+    assert np.all((slopes(v)[-1:] > 0.8) & (slopes(v)[-1:] < 1.1))
+
+
+def test_one_coordinate_gets_the_third_order_from_any_derivative():
+    reference = np.array(pendulum_reference(T))
+    error = []
+    for n in FINE:
+        end = march("angle", "decaying", 0.5, h=T / n, steps=n)
+        error.append(np.max(np.abs(np.concatenate([end.q, end.v]) - reference)))
+    np.testing.assert_allclose(slopes(error)[-2:], 3, rtol=0, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "alpha", "steps", "bound"),
+    [
+        ("preserving", 0.0, 200, 1e-3),
+        ("consistent", 0.0, 200, 5e-6),
+        ("composed 4", 0.0, 200, 5e-7),
+        ("composed 6", 0.0, 200, 1e-9),
+    ],
+)
+def test_error_on_the_double_pendulum(scheme, alpha, steps, bound):
+    # Truncation: C h^p at h = 0.01, 2 s.
+    q, _ = errors("double", scheme, alpha, (steps,))
+    assert q[0] <= bound
+
+
+def test_schemes_know_their_order():
+    expected = {
+        "preserving": 2,
+        "decaying": 2,
+        "kappa": 2,
+        "consistent": 4,
+        "composed 4": 4,
+        "composed 6": 6,
+        "composed 8": 8,
+        "consistent 6": 6,
+        "consistent 8": 8,
+    }
+    assert {name: SCHEMES[name](0.0).order for name in expected} == expected
+    assert ej.EnergyConsistent(0.5).order == 3
+
+
+@pytest.mark.parametrize(
+    ("scheme", "count"),
+    [("composed 4", 5), ("composed 6", 9), ("composed 8", 17), ("consistent 6", 5)],
+)
+def test_stages_are_a_palindrome_that_adds_up_to_the_step(scheme, count):
+    composed = SCHEMES[scheme](0.0)
+    stages = np.array(composed.stages)
+    assert stages.size == count
+    np.testing.assert_array_equal(stages, stages[::-1])
+    # Round-off, and the condition that removes the leading error.
+    power = composed.stage.order + 1
+    assert np.sum(stages) == pytest.approx(1, abs=1e-14)
+    assert np.sum(stages**power) == pytest.approx(0, abs=1e-14)

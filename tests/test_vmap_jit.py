@@ -1,0 +1,166 @@
+"""Batches equal loops, and new numbers never compile anything."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import enerjax as ej
+
+from .helpers import problem, SCHEMES
+
+
+# Solver: lanes are compiled differently, and Newton stops a few eps apart.
+SAME = dict(rtol=0, atol=1e-10)
+STEPS = 50
+SYSTEM = problem("double").system
+
+
+def run(numbers, scheme="decaying"):
+    alpha, h, g, q, v = numbers
+    args = problem("double").args | dict(g=g)
+    start = ej.State(q, v)
+    return ej.simulate(
+        SYSTEM, SCHEMES[scheme](alpha), start, args, h=h, num_steps=STEPS, throw=False
+    )
+
+
+def lanes():
+    angles = np.array([0.0, 0.3, 1.0])
+    inner = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    q = np.concatenate([inner, inner + [[0.0, 1.0]]], axis=1)
+    v = np.zeros((3, 4)) + np.array([[0.0], [0.1], [0.2]]) * [[0, 0, 1, 0]]
+    numbers = ([0.0, 0.4, 1.0], [0.005, 0.01, 0.015], [9.81, 5.0, 1.6], q, v)
+    return tuple(jnp.asarray(x) for x in numbers)
+
+
+def compare(batch, number, solution):
+    lane = jax.tree.map(lambda x: x[number], eqx.filter(batch, eqx.is_array))
+    np.testing.assert_allclose(lane.ys.q, solution.ys.q, **SAME)
+    np.testing.assert_allclose(lane.ys.v, solution.ys.v, **SAME)
+    np.testing.assert_allclose(lane.ts, solution.ts, **SAME)
+    np.testing.assert_allclose(lane.audit.dissipated, solution.audit.dissipated, **SAME)
+    # Multipliers are momenta per step: the tolerance over h.
+    np.testing.assert_allclose(lane.multipliers, solution.multipliers, rtol=0, atol=1e-8)
+    assert lane.stats.completed_steps == solution.stats.completed_steps == STEPS
+
+
+AXES = {"alpha": (0,), "h": (1,), "args": (2,), "start": (3, 4), "all": (0, 1, 2, 3, 4)}
+
+
+@pytest.mark.parametrize("swept", AXES)
+def test_vmap_equals_a_loop(swept):
+    numbers = lanes()
+    in_axes = tuple(0 if i in AXES[swept] else None for i in range(5))
+    pick = lambda x, axis, k: x if axis is None else x[k]
+    first = tuple(
+        x if axis == 0 else x[0] for x, axis in zip(numbers, in_axes, strict=True)
+    )
+    batch = eqx.filter_vmap(run, in_axes=(in_axes,))(first)
+    for k in range(3):
+        one = tuple(pick(x, a, k) for x, a in zip(first, in_axes, strict=True))
+        compare(batch, k, run(one))
+
+
+@pytest.mark.parametrize("scheme", ["consistent", "composed 4"])
+def test_vmap_over_everything_equals_a_loop(scheme):
+    numbers = lanes()
+    batch = eqx.filter_vmap(lambda x: run(x, scheme))(numbers)
+    for k in range(3):
+        compare(batch, k, run(tuple(x[k] for x in numbers), scheme))
+
+
+def test_vmap_over_systems_equals_a_loop():
+    """An inertia matrix is a leaf of the system, so systems can be stacked."""
+    potential = problem("double").system.potential
+    rods = problem("double").system.constraint
+    start, args = problem("double").start, problem("double").args
+
+    def with_mass(m):
+        system = ej.System(m * jnp.eye(4), potential, rods)
+        return ej.simulate(
+            system, ej.EnergyPreserving(), start, args, h=0.01, num_steps=20, throw=False
+        ).ys.q
+
+    masses = jnp.array([0.5, 1.0, 4.0])
+    batch = eqx.filter_vmap(with_mass)(masses)
+    for k in range(3):
+        np.testing.assert_allclose(batch[k], with_mass(masses[k]), **SAME)
+    assert np.max(np.abs(batch[0] - batch[2])) > 1e-3
+
+
+def test_jit_around_a_run_changes_nothing():
+    numbers = tuple(x[1] for x in lanes())
+    np.testing.assert_allclose(
+        eqx.filter_jit(run)(numbers).ys.q, run(numbers).ys.q, **SAME
+    )
+
+
+@pytest.mark.parametrize("scheme", ["preserving", "decaying"])
+def test_new_numbers_compile_nothing(scheme, caplog):
+    system, start, args = problem("pendulum")
+    make = SCHEMES[scheme]
+
+    def simulate(alpha, h, g, x, v):
+        y = (1 - x**2) ** 0.5
+        begin = ej.initial_state(system, [x, y], [v * y, -v * x], args | dict(g=g))
+        ej.simulate(system, make(alpha), begin, args | dict(g=g), h=h, num_steps=10)
+        ej.step(system, make(alpha), begin, args | dict(g=g), h=h)
+
+    first = dict(alpha=0.1, h=0.01, g=9.81, x=1.0, v=0.0)
+    simulate(**first)
+    changes = dict(alpha=0.2, h=0.02, g=1.6, x=0.6, v=0.5)
+    for name, value in changes.items():
+        with jax.log_compiles():
+            simulate(**first | {name: value})
+        compiled = [r.getMessage() for r in caplog.records if "Compiling" in r.getMessage()]
+        assert not compiled, f"a new {name} compiled {compiled}"
+
+
+def test_the_count_of_compilations_can_fail(caplog):
+    """The other side of the test above: a new number of steps is another program."""
+    system, start, args = problem("pendulum")
+    for num_steps in (3, 4):
+        caplog.clear()
+        with jax.log_compiles():
+            ej.simulate(
+                system, ej.EnergyPreserving(), start, args, h=0.01, num_steps=num_steps
+            )
+    assert any("Compiling" in record.getMessage() for record in caplog.records)
+
+
+def test_the_functions_of_the_user_are_traced_once():
+    count = 0
+
+    def potential(q, args):
+        nonlocal count
+        count += 1
+        return 0.5 * args["k"] * q @ q
+
+    system = ej.System(jnp.eye(2), potential)
+
+    def simulate(k, h, alpha, x):
+        nonlocal count
+        count = 0
+        start = ej.State([x, 0.0], [0.0, 0.0])
+        ej.simulate(
+            system, ej.EnergyDecaying(alpha), start, dict(k=k), h=h, num_steps=10
+        )
+        return count
+
+    assert simulate(1.0, 0.1, 0.5, 1.0) > 5
+    # What remains is the check of its shape, which runs no arithmetic.
+    for numbers in ((2.0, 0.1, 0.5, 1.0), (1.0, 0.2, 0.5, 1.0), (1.0, 0.1, 0.7, 2.0)):
+        assert simulate(*numbers) <= 1
+
+
+def test_lanes_that_finish_early_do_not_move():
+    """A batched Newton iterates until the last lane is done; the others must hold."""
+    numbers = lanes()
+    batch = eqx.filter_vmap(run)(numbers)
+    iterations = np.asarray(batch.stats.newton_iterations)
+    for k in range(3):
+        alone = run(tuple(x[k] for x in numbers))
+        difference = np.abs(iterations[k] - alone.stats.newton_iterations)
+        assert np.max(difference) <= 1
