@@ -76,7 +76,7 @@ def _states(
     return np.array(q), np.array(v)
 
 
-# Pendulums: angles from the direction of gravity, which is +y ---------------------------
+# Pendulums: angles from the direction of gravity, which is +y -------------------------
 
 
 def _swing(y: Vector, args: Args) -> Vector:
@@ -122,14 +122,19 @@ def _spring(y: Vector, args: Args) -> Vector:
     return np.concatenate([v, force / args["m"]])
 
 
-# The heavy top about its fixed point: a quaternion and the body's angular velocity ------
+# The heavy top about its fixed point: a quaternion and the body's angular velocity ----
+
+
+def _cross(a: Vector) -> Vector:
+    """`a x`, as a matrix."""
+    x, y, z = a
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def _rotation(p: Vector) -> Vector:
-    """`v + 2 e0 e x v + 2 e x (e x v)`, as a matrix."""
-    x, y, z = p[1:]
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + 2 * p[0] * cross + 2 * cross @ cross
+    """`1 + 2 e0 e x + 2 e x e x`, as a matrix."""
+    turn = _cross(p[1:])
+    return np.eye(3) + 2 * p[0] * turn + 2 * turn @ turn
 
 
 def _top(y: Vector, args: Args) -> Vector:
@@ -139,14 +144,14 @@ def _top(y: Vector, args: Args) -> Vector:
         centre @ centre * np.eye(3) - np.outer(centre, centre)
     )
     weight = _rotation(p).T @ np.array([0.0, 0.0, -m * args["g"]])
-    torque = np.cross(centre, weight) - np.cross(spin, about_tip @ spin)
-    turn = 0.5 * np.array([-p[1:] @ spin, *(p[0] * spin + np.cross(p[1:], spin))])
+    torque = _cross(centre) @ weight - _cross(spin) @ about_tip @ spin
+    turn = 0.5 * np.array([-p[1:] @ spin, *(p[0] * spin + _cross(p[1:]) @ spin)])
     return np.concatenate([turn, np.linalg.solve(about_tip, torque)])
 
 
 def _top_state(y: Vector, args: Args) -> tuple[Vector, Vector]:
     p, spin, rotation = y[:4], y[4:], _rotation(y[:4])
-    x, xdot = rotation @ args["centre"], rotation @ np.cross(spin, args["centre"])
+    x, xdot = rotation @ args["centre"], rotation @ _cross(spin) @ args["centre"]
     return np.concatenate([x, p]), np.concatenate([xdot, spin])
 
 

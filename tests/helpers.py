@@ -1,17 +1,15 @@
-"""Problems, schemes, runs and references that the tests share.
+"""Problems, schemes and runs that the tests share.
 
 Compilation dominates: runs are cached, those that differ in numbers alone share a program,
 and `march` has one program for all numbers of steps.
 """
 
 import functools
-from types import SimpleNamespace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.integrate import solve_ivp
 
 import enerjax as ej
 
@@ -110,61 +108,3 @@ def slopes(errors):
     """Orders between halvings of the step."""
     errors = np.asarray(errors)
     return np.log2(errors[:-1] / errors[1:])
-
-
-# References in minimal coordinates, by an explicit method of order 8 -------------------
-
-
-def _integrate(rates, start, t):
-    return solve_ivp(rates, (0, t), start, method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
-
-
-@functools.cache
-def pendulum_reference(t, g=9.81, l=1.0):
-    """Angle from the vertical and its rate; released from the horizontal at rest."""
-    return _integrate(lambda _, y: [y[1], -g / l * np.sin(y[0])], [np.pi / 2, 0.0], t)
-
-
-@functools.cache
-def double_pendulum_reference(t, m1=1.0, m2=1.0, g=9.81):
-    """Points and velocities of two unit rods; angles from +x towards +y, gravity +y."""
-
-    def rates(_, y):
-        a, b, da, db = y
-        coupling = m2 * np.cos(a - b)
-        inertia = np.array([[m1 + m2, coupling], [coupling, m2]])
-        swirl = m2 * np.sin(a - b)
-        torque = [
-            -swirl * db**2 + (m1 + m2) * g * np.cos(a),
-            swirl * da**2 + m2 * g * np.cos(b),
-        ]
-        return [da, db, *np.linalg.solve(inertia, torque)]
-
-    a, b, da, db = _integrate(rates, [0.0, np.pi / 2, 0.0, 0.0], t)
-    inner, outer = np.array([np.cos(a), np.sin(a)]), np.array([np.cos(b), np.sin(b)])
-    turn = np.array([[0, -1], [1, 0]])
-    v_inner, v_outer = da * turn @ inner, db * turn @ outer
-    return SimpleNamespace(
-        q=np.concatenate([inner, inner + outer]),
-        v=np.concatenate([v_inner, v_inner + v_outer]),
-    )
-
-
-@functools.cache
-def spring_pendulum_reference(t, k=100.0, g=9.81):
-    def rates(_, y):
-        length = np.hypot(y[0], y[1])
-        pull = -k * (length - 1) / length
-        return [y[2], y[3], pull * y[0], pull * y[1] + g]
-
-    y = _integrate(rates, [1.0, 0.0, 0.0, 0.0], t)
-    return SimpleNamespace(q=y[:2], v=y[2:])
-
-
-def point_on_rod(t):
-    """Case b from the angle of case a: the same motion, with gravity along +y."""
-    angle, rate = pendulum_reference(t)
-    return SimpleNamespace(
-        q=np.array([np.sin(angle), np.cos(angle)]),
-        v=rate * np.array([np.cos(angle), -np.sin(angle)]),
-    )

@@ -1,4 +1,4 @@
-"""The energy identities where the potential is not linear: what decays, and what may not."""
+"""The energy identities where the potential is not linear."""
 
 import functools
 

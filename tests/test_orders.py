@@ -5,13 +5,11 @@ import pytest
 
 import enerjax as ej
 
-from .helpers import (
+from .helpers import march, SCHEMES, slopes
+from .references import (
     double_pendulum_reference,
-    march,
     pendulum_reference,
     point_on_rod,
-    SCHEMES,
-    slopes,
     spring_pendulum_reference,
 )
 
@@ -86,19 +84,18 @@ def test_errors_shrink_with_the_order_of_the_scheme(
 
 
 def test_nine_stages_raise_the_fourth_order_to_eight():
-    n = np.array([8, 12, 16, 24])
-    for error in errors("pendulum", "consistent 8", 0.0, tuple(n)):
-        slope = np.log(error[0] / error[-1]) / np.log(n[-1] / n[0])
-        assert slope > 7.5
-        assert error[-1] < 1e-8
+    for error in errors("pendulum", "consistent 8", 0.0, (12, 24)):
+        # One halving: the next one ends in round-off.
+        assert error[1] > PLATEAU
+        np.testing.assert_allclose(slopes(error), 8, rtol=0, atol=0.3)
 
 
 @pytest.mark.parametrize("alpha", [0.5, 1.0])
 def test_index3_converges_more_slowly(alpha):
     """It loses an order in the velocities: about 1.6 in q and 1 in v."""
-    q, v = errors("pendulum", "decaying index3", alpha, FINE)
-    assert np.all((slopes(q) > 1.2) & (slopes(q) < 2.0))
-    assert np.all((slopes(v)[-1:] > 0.8) & (slopes(v)[-1:] < 1.1))
+    q, v = (slopes(e)[-1] for e in errors("pendulum", "decaying index3", alpha, FINE))
+    assert 1.5 < q < 1.9
+    assert v == pytest.approx(1, abs=0.1)
 
 
 def test_one_coordinate_gets_the_third_order_from_any_derivative():

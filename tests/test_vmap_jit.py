@@ -73,18 +73,16 @@ def test_vmap_over_everything_equals_a_loop(scheme):
 
 def test_vmap_over_systems_equals_a_loop():
     """An inertia matrix is a leaf of the system, so systems can be stacked."""
-    potential = problem("double").system.potential
-    rods = problem("double").system.constraint
-    start, args = problem("double").start, problem("double").args
+    (system, start, args) = problem("spring")
 
     def with_mass(m):
-        system = ej.System(m * jnp.eye(4), potential, rods)
+        heavier = ej.System(m * jnp.eye(2), system.potential)
         return ej.simulate(
-            system, ej.EnergyPreserving(), start, args, h=0.01, num_steps=20, throw=False
+            heavier, ej.EnergyPreserving(), start, args, h=0.01, num_steps=20, throw=False
         ).ys.q
 
     masses = jnp.array([0.5, 1.0, 4.0])
-    batch = eqx.filter_vmap(with_mass)(masses)
+    batch = jax.vmap(with_mass)(masses)
     for k in range(3):
         np.testing.assert_allclose(batch[k], with_mass(masses[k]), **SAME)
     assert np.max(np.abs(batch[0] - batch[2])) > 1e-3

@@ -123,7 +123,8 @@ def _project(
     )
     jacobian = jax.lax.stop_gradient(model.constraint_jacobian(q))
     unit = jacobian / model.scales.coordinate[None, :] / model.scales.constraint[:, None]
-    return start, near, jnp.linalg.matrix_rank(unit)
+    rank = jnp.linalg.matrix_rank(unit) if unit.size > 0 else jnp.array(0)
+    return start, near, rank
 
 
 def _project_position(model: Model, guess: Coordinates) -> tuple[Coordinates, Flag]:

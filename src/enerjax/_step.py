@@ -195,7 +195,8 @@ def _solve(
     )
     z = jax.tree.map(jnp.multiply, x, unknown_scale)
     end = scheme.finish(z, problem)
-    result = first_failure(from_root_finder(result), end.result)
+    # What the scheme itself can tell of a failed iterate says more than that it failed.
+    result = first_failure(end.result, from_root_finder(result))
     memory = jax.tree.map(
         lambda x, x0, old: jnp.stack([x - x0, old[0], old[1]]), z, flight, memory
     )

@@ -39,9 +39,9 @@ class EnergyDecaying(AbstractSingleSolve[JumpAndEnd, StepProblem]):
       to `rho_inf = (1 - alpha) / (1 + alpha)` as `h w` grows.
     - Constraints held at: position level at `zj` and `z1`; with `formulation="ggl"`
       velocity level too.
-    - Order: 2 constrained. Unconstrained with `v = qdot`, 3 with `MeanValue()` or one
-      coordinate, else 2. `"index3"` is the paper's, and *locks* on constrained motion at
-      `alpha = 0` while it dissipates far too much above.
+    - Order: 2. Unconstrained with `v = qdot`, 3 with `MeanValue()` or one coordinate.
+      `"index3"` is the paper's: on constrained motion it tends to order 1, *locks* at
+      `alpha = 0` and dissipates far too much above.
 
     **Arguments:**
 
@@ -77,7 +77,7 @@ class EnergyDecaying(AbstractSingleSolve[JumpAndEnd, StepProblem]):
 
     @property
     def order(self) -> int:
-        return 2
+        return 2 if self.formulation == "ggl" else 1
 
     @property
     def symmetric(self) -> bool:

@@ -1,0 +1,157 @@
+"""Rules of matrix factorisations and solves: the product rule, solved for the factor.
+
+Each satisfies the equation that defines its output with the means of the two points in the
+places of the factors, so that the difference is exact: `A x = b` gives
+`mean(A) dx = db - dA mean(x)`. The mean of two regular matrices can be singular (between a
+rotation and its opposite): the increment is then not finite.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import jaxpr_as_fun
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
+
+from .transform import (
+    at_a,
+    at_b,
+    evaluate,
+    increment,
+    moves,
+    Moving,
+    NoRule,
+    Switching,
+    Value,
+)
+
+
+def _ends(values: list[Value], params: dict[str, Any]) -> tuple[list[Array], list[Array]]:
+    params = {k: v for k, v in params.items() if k != "walk"}
+    primitive = params.pop("primitive")
+    a = evaluate(primitive, list(map(at_a, values)), params)
+    return a, evaluate(primitive, list(map(at_b, values)), params)
+
+
+def _transposed(x: Array) -> Array:
+    return jnp.swapaxes(x, -1, -2)
+
+
+def _lower(factor: Array, right: Array, unit: bool = False) -> Array:
+    """`factor^-1 right` with a lower triangular factor."""
+    return jax.lax.linalg.triangular_solve(
+        factor, right, left_side=True, lower=True, unit_diagonal=unit
+    )
+
+
+def cholesky(values: list[Value], params: dict[str, Any]) -> list[Value]:
+    """`dA = dL Lm^T + Lm dL^T`, so `Lm^-1 dA Lm^-T` is `Lm^-1 dL` plus its transpose."""
+    (matrix,) = values
+    (a,), (b,) = _ends(values, params)
+    # The primitive leaves the upper triangle undefined.
+    mean = jnp.tril(0.5 * (a + b))
+    symmetric = 0.5 * (matrix.d + _transposed(matrix.d))
+    inner = _lower(mean, _transposed(_lower(mean, symmetric)))
+    eye = jnp.eye(a.shape[-1], dtype=a.dtype)
+    return [Moving(a, b, mean @ (jnp.tril(inner) - 0.5 * inner * eye))]
+
+
+def triangular_solve(values: list[Value], params: dict[str, Any]) -> list[Value]:
+    if params["conjugate_a"]:
+        raise NoRule
+    (a,), (b,) = _ends(values, params)
+    matrix, right = values
+    lower, unit = params["lower"], params["unit_diagonal"]
+    used = (jnp.tril if lower else jnp.triu)(
+        jnp.ones(at_a(matrix).shape, bool), -1 * unit * lower
+    )
+    if unit and not lower:
+        used = jnp.triu(used, 1)
+    change = increment(right)
+    if moves(matrix):
+        moved = jnp.where(used, matrix.d, 0)
+        moved = _transposed(moved) if params["transpose_a"] else moved
+        mean = 0.5 * (a + b)
+        change = change - (moved @ mean if params["left_side"] else mean @ moved)
+    factor = 0.5 * (at_a(matrix) + at_b(matrix))
+    options = {k: v for k, v in params.items() if k not in ("walk", "primitive")}
+    return [Moving(a, b, jax.lax.linalg.triangular_solve(factor, change, **options))]
+
+
+def linear_solve(values: list[Value], params: dict[str, Any]) -> list[Value]:
+    """`matvec(x) = b`: what factorised the matrix does not matter, its product does."""
+    lengths, program = params["const_lengths"], params["jaxprs"].matvec
+    consts = values[: lengths.matvec]
+    right = values[sum(lengths) :]
+    if any(isinstance(v, Switching) for v in (*consts, *right)):
+        raise NoRule
+    ends = _ends(values, params)
+    walk = params["walk"]
+    means = [0.5 * (a + b) for a, b in zip(*ends, strict=True)]
+    changes = [increment(v) for v in right]
+    if any(moves(c) for c in consts):
+        moved = walk.closed(program, [*consts, *means])
+        changes = [db - increment(m) for db, m in zip(changes, moved, strict=True)]
+    middle = [0.5 * (at_a(c) + at_b(c)) if moves(c) else c for c in consts]
+    out = _solve(program, middle, changes)
+    return [Moving(a, b, d) for a, b, d in zip(*ends, out, strict=True)]
+
+
+def _solve(program: Any, consts: list[Array], right: list[Array]) -> list[Array]:
+    """`x` in `program(consts, x) = right`, linear in `x`, by a dense matrix."""
+    axis = _column_axis(program.jaxpr)
+    if axis is not None:
+        of_matrix, of_x = axis
+        matrix = consts[0] if of_matrix == 1 else consts[0].T
+        columns = jnp.moveaxis(right[0], of_x, 0)
+        flat = columns.reshape(columns.shape[0], -1)
+        out = jnp.linalg.solve(matrix, flat).reshape(columns.shape)
+        return [jnp.moveaxis(out, 0, of_x)]
+    flat, unravel = ravel_pytree(right)
+    product = lambda x: ravel_pytree(jaxpr_as_fun(program)(*consts, *unravel(x)))[0]
+    return unravel(jnp.linalg.solve(jax.jacfwd(product)(flat), flat))
+
+
+def _column_axis(jaxpr: Any) -> tuple[int, int] | None:
+    """The contracted axes of matrix and `x`, if the program is a product with one matrix.
+
+    Many right-hand sides (an inverse) are then solved for with one small matrix, where the
+    general way would take them for one long vector.
+    """
+    first = jaxpr.eqns[0]
+    if first.primitive.name != "dot_general" or first.invars != jaxpr.invars:
+        return None
+    (contracted, batch) = first.params["dimension_numbers"]
+    only_moved = all(e.primitive.name in ("transpose", "squeeze") for e in jaxpr.eqns[1:])
+    if first.invars[0].aval.ndim != 2 or any(map(len, batch)) or not only_moved:
+        return None
+    return contracted[0][0], contracted[1][0]
+
+
+def lu(values: list[Value], params: dict[str, Any]) -> list[Value]:
+    """`P dA = dL Um + Lm dU`, where both points pivot alike.
+
+    Where they do not, the factors of `b` with the rows of `a` have no relation to those
+    that were asked for: the true difference is shared out over the matrix.
+    """
+    (matrix,) = values
+    (fa, pa, ra), (fb, pb, rb) = _ends(values, params)
+    if matrix.a.ndim != 2 or matrix.a.shape[0] != matrix.a.shape[1]:
+        raise NoRule
+    mean = 0.5 * (fa + fb)
+    eye = jnp.eye(mean.shape[0], dtype=mean.dtype)
+    # Pivots that change sign leave a mean without inverse.
+    keep = jnp.diagonal(fa) * jnp.diagonal(fb) > 0
+    same = jnp.all(ra == rb) & jnp.all(keep)
+    lower = jnp.tril(mean, -1) + eye
+    upper = jnp.where(same, jnp.triu(mean), eye)
+    inner = _lower(lower, matrix.d[ra], unit=True)
+    inner = jax.lax.linalg.triangular_solve(upper, inner, left_side=False, lower=False)
+    exact = lower @ jnp.tril(inner, -1) + jnp.triu(inner) @ upper
+    moved = matrix.b - matrix.a
+    squares, decided = jnp.sum(moved**2), jnp.sum(moved * matrix.d)
+    shared = (fb - fa) * decided / jnp.where(squares > 0, squares, 1)
+    factors = Moving(fa, fb, jnp.where(same, exact, shared))
+    decides = [jnp.broadcast_to(x, pa.shape) for x in (squares, decided)]
+    return [factors, Switching(pa, pb, *decides), Switching(ra, rb, *decides)]

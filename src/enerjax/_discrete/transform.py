@@ -1,0 +1,138 @@
+"""Discrete differentiation by the chain rule, as a program transformation.
+
+Difference quotients obey an exact chain rule: where every primitive `y = f(x)` of a
+program has a linear map `D` with `y_b - y_a = D (x_b - x_a)`, the composition of these maps
+takes the difference of the program's inputs to the difference of its outputs, exactly. So a
+traced program is walked once with triples: the value at `a`, the value at `b`, and an
+increment that enters linearly. With the increment `b - a` the output increment is
+`f(b) - f(a)`; transposed, the map is a discrete gradient.
+
+Nothing is divided by `|b - a|`: each rule in `rules.py` is a closed form, symmetric in `a`
+and `b` and free of cancellation, so value and derivatives are right at any increment, zero
+included. And because the map follows the user's own composition (differences of positions,
+then dot products, then functions of distances), it inherits the symmetries that the program
+shows: a discrete gradient of a function of distances exerts no net force and no torque.
+
+**To add a rule:** write `rule(values, params)` in `rules.py` for the name that the primitive
+has in `jax.make_jaxpr`, from the helpers there. `values` has one entry an operand, plain
+where the operand is the same at `a` and `b`, else a `Moving`; return the same for each output.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
+
+import jax.numpy as jnp
+from jax.extend.core import ClosedJaxpr, Literal
+from jaxtyping import Array
+
+
+class Moving(NamedTuple):
+    """A number that differs between the two points."""
+
+    a: Array
+    b: Array
+    d: Array  # increment, linear in that of the input; b - a where the input's is
+
+
+class Switching(NamedTuple):
+    """A truth value or integer that may differ between the two points.
+
+    It has no increment. What decided it is kept in its place: the sum of the squares of the
+    changes of the deciding numbers, and of their products with their increments. Where the
+    value differs, `change * decided / squares` is an increment with the right total.
+    """
+
+    a: Array
+    b: Array
+    squares: Array
+    decided: Array
+
+
+Value: TypeAlias = Any  # an array, a Moving or a Switching
+Rule: TypeAlias = Callable[[list[Value], dict[str, Any]], list[Value]]
+
+
+def at_a(value: Value) -> Array:
+    return value.a if isinstance(value, Moving | Switching) else value
+
+
+def at_b(value: Value) -> Array:
+    return value.b if isinstance(value, Moving | Switching) else value
+
+
+def increment(value: Value) -> Array:
+    return value.d if isinstance(value, Moving) else jnp.zeros_like(value)
+
+
+def moves(value: Value) -> bool:
+    return isinstance(value, Moving | Switching)
+
+
+class NoRule(Exception):
+    """A rule that does not cover these operands; the fallback does."""
+
+
+class Walk:
+    """One pass over a program. `fallbacks` collects the primitives without a rule."""
+
+    def __init__(self, rules: dict[str, Rule], fallback: Callable):
+        self._rules = rules
+        self._fallback = fallback
+        self.fallbacks: list[str] = []
+
+    def closed(self, jaxpr: ClosedJaxpr, inputs: list[Value]) -> list[Value]:
+        return self.open(jaxpr.jaxpr, jaxpr.consts, inputs)
+
+    def open(self, jaxpr: Any, consts: list[Value], inputs: list[Value]) -> list[Value]:
+        """The outputs of a program for inputs that may move."""
+        known: dict[Any, Value] = {}
+        read = lambda atom: atom.val if isinstance(atom, Literal) else known[atom]
+        known.update(zip(jaxpr.constvars, consts, strict=True))
+        known.update(zip(jaxpr.invars, inputs, strict=True))
+        for equation in jaxpr.eqns:
+            values = [read(atom) for atom in equation.invars]
+            known.update(
+                zip(equation.outvars, self._equation(equation, values), strict=True)
+            )
+        return [read(atom) for atom in jaxpr.outvars]
+
+    def _equation(self, equation: Any, values: list[Value]) -> list[Value]:
+        primitive, params = equation.primitive, equation.params
+        if not any(moves(value) for value in values):
+            return evaluate(primitive, values, params)
+        inner = _INNER.get(primitive.name)
+        if inner is not None:
+            program = params[inner]
+            consts = program.consts if isinstance(program, ClosedJaxpr) else []
+            return self.open(getattr(program, "jaxpr", program), consts, values)
+        rule = self._rules.get(primitive.name)
+        try:
+            if rule is None:
+                raise NoRule
+            return rule(values, dict(params, walk=self, primitive=primitive))
+        except NoRule:
+            outs = self._fallback(primitive, values, params)
+            if any(isinstance(out, Moving) for out in outs):
+                self.fallbacks.append(primitive.name)
+            return outs
+
+
+# Primitives that only wrap a program, and the parameter that holds it.
+_INNER = {
+    "jit": "jaxpr",
+    "pjit": "jaxpr",
+    "closed_call": "call_jaxpr",
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr",
+    "checkpoint": "jaxpr",
+    "remat2": "jaxpr",
+}
+
+
+def evaluate(primitive: Any, values: list[Any], params: dict[str, Any]) -> list[Any]:
+    """The outputs of a primitive, as a list."""
+    bound = primitive.get_bind_params(params)
+    # A pair before JAX 0.10, the parameters alone since.
+    functions, params = bound if isinstance(bound, tuple) else ((), bound)
+    out = primitive.bind(*functions, *values, **params)
+    return list(out) if primitive.multiple_results else [out]

@@ -1,0 +1,220 @@
+"""The rules that the package is written by."""
+
+import ast
+import importlib
+import inspect
+import pathlib
+import pkgutil
+
+import equinox as eqx
+import pytest
+
+import enerjax as ej
+
+
+PACKAGE = pathlib.Path(ej.__file__).parent
+SOURCES = sorted(PACKAGE.rglob("*.py"))
+TESTS = sorted(pathlib.Path(__file__).parent.glob("*.py"))
+
+# Each imports only from lower layers: from what stands further up.
+LAYERS = [
+    {"_types", "_results", "_tracing"},
+    {"_discrete", "_kinematics", "_newton"},
+    {"_system"},
+    {"_model"},
+    {"_segment", "_audit"},
+    {"_schemes", "_scaling", "_solution"},
+    {"_check"},
+    {"_step", "_initial"},
+    {"_simulate", "problems"},
+    {"_report"},
+    {"__main__"},
+]
+LAYER = {name: number for number, names in enumerate(LAYERS) for name in names}
+
+
+def part(path):
+    """The module or subpackage directly below `enerjax` that a file belongs to."""
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def imports(path):
+    """Modules of `enerjax` and others that a file imports, and the names it takes."""
+    inside = path.relative_to(PACKAGE).with_suffix("").parts
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield alias.name, ()
+        elif isinstance(node, ast.ImportFrom):
+            names = tuple(alias.name for alias in node.names)
+            module = node.module or ""
+            if node.level == 0:
+                yield module, names
+                continue
+            base = ("enerjax", *inside[: len(inside) - node.level])
+            if module:
+                yield ".".join((*base, module)), names
+            else:
+                yield from ((".".join((*base, name)), ()) for name in names)
+
+
+def parts_imported(path):
+    for module, names in imports(path):
+        if module == "enerjax":
+            yield from names
+        elif module.startswith("enerjax."):
+            yield module.split(".")[1]
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_go_one_way(path):
+    own = part(path)
+    if own == "__init__":
+        pytest.skip("re-exports everything")
+    assert own in LAYER, f"{own} has no place among the layers"
+    for other in parts_imported(path):
+        assert other == own or LAYER[other] < LAYER[own], f"{path.name} imports {other}"
+
+
+def files_of(name):
+    return [path for path in SOURCES if part(path) == name]
+
+
+def all_imports(name):
+    return {module for path in files_of(name) for module, _ in imports(path)}
+
+
+def test_the_imports_are_seen():
+    """Against a parser that finds nothing."""
+    assert "enerjax._model" in all_imports("_schemes")
+    assert "enerjax._discrete.base" in all_imports("_discrete")
+    assert "_system" in {x for path in files_of("problems") for x in parts_imported(path)}
+
+
+def test_newton_knows_no_mechanics():
+    ours = {module for module in all_imports("_newton") if module.startswith("enerjax")}
+    assert ours <= {"enerjax._types"}
+
+
+def test_schemes_know_no_solver():
+    for module in all_imports("_schemes"):
+        assert module.split(".")[0] not in ("optimistix", "lineax")
+        assert module != "enerjax._newton"
+
+
+def test_the_run_knows_no_scheme_by_name():
+    for name in ("_step", "_simulate", "_check", "_scaling"):
+        for path in files_of(name):
+            for module, names in imports(path):
+                if module.startswith("enerjax._schemes"):
+                    assert all(taken.startswith("Abstract") for taken in names)
+
+
+def test_problems_are_made_of_what_users_have():
+    used = {x for path in files_of("problems") for x in parts_imported(path)} - {"problems"}
+    assert used <= {"_types", "_system", "_initial"}
+
+
+@pytest.mark.parametrize("path", SOURCES + TESTS, ids=lambda path: path.name)
+def test_modules_are_short(path):
+    assert len(path.read_text().splitlines()) <= 250
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.name)
+def test_nothing_private_of_the_libraries_is_used(path):
+    for module, names in imports(path):
+        full = {module, *(f"{module}.{name}" for name in names)}
+        private = ("equinox.internal", "jax._src", "jax.interpreters", "optimistix._")
+        assert not [x for x in full if x.startswith(private)]
+    text = path.read_text()
+    assert "eqx.internal" not in text
+    assert "eqxi" not in text
+
+
+def modules():
+    names = [info.name for info in pkgutil.walk_packages([str(PACKAGE)], "enerjax.")]
+    return [importlib.import_module(x) for x in names if not x.endswith("__main__")]
+
+
+def classes():
+    """The equinox modules that the package defines."""
+    found = {
+        x
+        for module in modules()
+        for x in vars(module).values()
+        if inspect.isclass(x) and issubclass(x, eqx.Module)
+    }
+    ours = {x for x in found if x.__module__.startswith("enerjax")}
+    return sorted(ours, key=lambda x: x.__qualname__)
+
+
+def is_abstract(cls):
+    return cls.__name__.lstrip("_").startswith("Abstract")
+
+
+@pytest.mark.parametrize("cls", classes(), ids=lambda cls: cls.__qualname__)
+def test_classes_are_abstract_or_final(cls):
+    bases = [base for base in cls.__mro__[1:] if base.__module__.startswith("enerjax")]
+    assert all(is_abstract(base) for base in bases), "a final class was subclassed"
+    unfinished = bool(getattr(cls, "__abstractmethods__", ())) or bool(
+        getattr(cls, "__abstractvars__", ())
+    )
+    assert unfinished == is_abstract(cls)
+    for name, value in vars(cls).items():
+        if not (inspect.isfunction(value) or isinstance(value, property)):
+            continue
+        if name.startswith("__"):
+            continue
+        for base in bases:
+            inherited = vars(base).get(name)
+            overridden = inherited is not None and not getattr(
+                inherited, "__isabstractmethod__", False
+            )
+            assert not overridden, f"{name} of {base.__name__} is overridden"
+
+
+def public():
+    for owner in (ej, ej.problems):
+        for name, value in vars(owner).items():
+            if not name.startswith("_") and not inspect.ismodule(value):
+                yield f"{owner.__name__}.{name}", value
+
+
+@pytest.mark.parametrize(("name", "value"), list(public()), ids=lambda x: str(x)[:40])
+def test_public_names_have_a_docstring(name, value):
+    # Dataclasses write one themselves, which says nothing.
+    doc = vars(value).get("__doc__") if inspect.isclass(value) else value.__doc__
+    assert doc
+    assert not doc.startswith(f"{name.split('.')[-1]}(")
+    assert doc.strip().splitlines()[0].rstrip().endswith((".", ",", ":", ";"))
+
+
+def test_public_methods_have_a_docstring():
+    for _, value in public():
+        if not inspect.isclass(value) or not value.__module__.startswith("enerjax"):
+            continue
+        for name, method in vars(value).items():
+            if isinstance(method, classmethod) and not name.startswith("_"):
+                assert method.__doc__, f"{value.__name__}.{name}"
+
+
+def test_the_public_interface_is_the_one_of_the_documentation():
+    names = {name.removeprefix("enerjax.") for name, _ in public()}
+    assert {
+        "System",
+        "State",
+        "initial_state",
+        "consistent_start",
+        "simulate",
+        "step",
+        "EnergyPreserving",
+        "EnergyDecaying",
+        "KappaDecaying",
+        "EnergyConsistent",
+        "Composed",
+        "Gonzalez",
+        "MeanValue",
+        "Newton",
+        "Solution",
+        "RESULTS",
+    } <= names

@@ -1,0 +1,218 @@
+"""Failures are values: reported where they happen, with all that came before intact."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import enerjax as ej
+
+from .helpers import failed, problem, solve, TURNOVER
+
+
+# Runs that end in a failure: case d with a long step at index 3, and kappa wherever the
+# kinetic energy stops changing for a moment.
+FAILING = [
+    ("stiff", "preserving index3", 0.0, 0.01),
+    ("stiff", "decaying index3", 0.0, 0.01),
+    ("stiff", "decaying index3", 0.5, 0.01),
+    *[("double", "kappa", alpha, 0.01) for alpha in (0.0, 0.5, 1.0)],
+    *[("stiff", "kappa", alpha, 0.001) for alpha in (0.0, 0.5, 1.0)],
+]
+STEPS = 1000
+
+
+def run(name, scheme, alpha, h):
+    return solve(name, scheme, alpha, h=h, steps=STEPS)
+
+
+@pytest.mark.parametrize(("name", "scheme", "alpha", "h"), FAILING)
+def test_a_failure_is_reported_at_the_step_where_it_happens(name, scheme, alpha, h):
+    solution = run(name, scheme, alpha, h)
+    assert failed(solution)
+    assert len(ej.RESULTS[solution.result]) > 50
+    done = int(solution.stats.completed_steps)
+    assert 0 < done < STEPS
+    good, bad = slice(0, done + 1), slice(done + 1, None)
+    for x in (
+        solution.ys.q,
+        solution.ys.v,
+        solution.multipliers,
+        solution.audit.energy,
+        solution.audit.dissipated,
+        solution.audit.constraint,
+    ):
+        assert np.all(np.isfinite(x[good]))
+        assert np.all(np.isnan(x[bad]))
+    np.testing.assert_allclose(solution.ts, h * np.arange(STEPS + 1), rtol=1e-14)
+    # Everything up to there is a good run. Solver.
+    assert np.max(np.abs(solution.audit.constraint[good])) <= 1e-12
+    leak = np.diff(solution.audit.energy[good]) + solution.audit.dissipated[1 : done + 1]
+    assert np.max(np.abs(leak)) <= 1e-12 * TURNOVER[name]
+    iterations = solution.stats.newton_iterations
+    assert np.all(iterations[: done + 1] > 0)
+    assert np.all(iterations[done + 1 :] == 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "scheme", "alpha", "h"), [FAILING[0], FAILING[4]], ids=["index3", "kappa"]
+)
+def test_rows_before_a_failure_are_those_of_a_shorter_run(name, scheme, alpha, h):
+    solution = run(name, scheme, alpha, h)
+    done = int(solution.stats.completed_steps)
+    shorter = solve(name, scheme, alpha, h=h, steps=done)
+    assert not failed(shorter)
+    for x, y in ((solution.ys.q, shorter.ys.q), (solution.ys.v, shorter.ys.v)):
+        # Round-off: the same steps, but compiled as another program.
+        np.testing.assert_allclose(x[: done + 1], y, rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("h", [0.02, 0.05])
+@pytest.mark.parametrize("alpha", [0.0, 0.5, 1.0])
+def test_kappa_ends_a_long_run_by_its_law_or_says_where_it_left_it(alpha, h):
+    """In 1e5 steps the kinetic energy comes close to a standstill many times."""
+    steps = 100_000
+    solution = solve("pendulum", "kappa", alpha, h=h, steps=steps)
+    done = int(solution.stats.completed_steps)
+    assert failed(solution) == (done < steps)
+    assert done > 1000
+    energy = solution.audit.energy[: done + 1]
+    leak = np.diff(energy) + solution.audit.dissipated[1 : done + 1]
+    # Solver, in each step.
+    assert np.max(np.diff(energy)) <= 1e-12 * TURNOVER["pendulum"]
+    assert np.max(np.abs(leak)) <= 1e-12 * TURNOVER["pendulum"]
+    assert np.all(np.abs(solution.details[:done] - 1) < 1)
+    assert np.all(np.isnan(solution.details[done:]))
+    # The law tells something: kappa does leave the neighbourhood of 1.
+    assert np.max(np.abs(solution.details[:done] - 1)) > 1e-5
+
+
+def test_throw_raises_one_error_that_names_the_step_and_the_time():
+    system, start, args = problem("stiff")
+    done = int(run("stiff", "preserving index3", 0.0, 0.01).stats.completed_steps)
+    with pytest.raises(RuntimeError, match=f"step {done + 1}, from t = ") as caught:
+        ej.simulate(
+            system,
+            ej.EnergyPreserving("index3"),
+            start,
+            args,
+            h=0.01,
+            num_steps=STEPS,
+        )
+    message = str(caught.value)
+    assert f"t = {done * 0.01:.6g} to {(done + 1) * 0.01:.6g}" in message
+    assert "Newton" in message
+    assert "throw=False" in message
+
+
+def test_throw_raises_under_jit_too():
+    system, start, args = problem("pendulum")
+
+    @jax.jit
+    def fn(h):
+        return ej.simulate(
+            system, ej.EnergyPreserving(), start, args, h=h, num_steps=5
+        ).ys.q
+
+    assert np.all(np.isfinite(fn(0.01)))
+    with pytest.raises(Exception, match="Newton"):
+        jax.block_until_ready(fn(50.0))
+
+
+@pytest.mark.parametrize(
+    ("q", "v"), [([1.1, 0.0], [0.0, 0.0]), ([1.0, 0.0], [0.1, 0.0])], ids=["q", "v"]
+)
+def test_an_inconsistent_start_is_a_failure_of_the_first_step(q, v):
+    system, _, args = problem("pendulum")
+    solution = ej.simulate(
+        system,
+        ej.EnergyPreserving(),
+        ej.State(q, v),
+        args,
+        h=0.01,
+        num_steps=5,
+        throw=False,
+    )
+    assert solution.result == ej.RESULTS.inconsistent_start
+    assert solution.stats.completed_steps == 0
+    assert np.all(np.isfinite(solution.ys.q[0]))
+    assert np.all(np.isnan(solution.ys.q[1:]))
+    assert np.all(np.asarray(solution.stats.newton_iterations) == 0)
+
+
+def test_index3_does_not_hold_the_velocities_of_the_start():
+    """It starts from a velocity off the constraints, which its first step projects."""
+    system, _, args = problem("pendulum")
+    solution = ej.simulate(
+        system,
+        ej.EnergyPreserving("index3"),
+        ej.State([1.0, 0.0], [0.01, 0.0]),
+        args,
+        h=0.01,
+        num_steps=5,
+    )
+    assert solution.stats.completed_steps == 5
+
+
+def test_a_failed_lane_leaves_the_others_unchanged():
+    system, start, args = problem("pendulum")
+
+    def fn(h):
+        return ej.simulate(
+            system, ej.EnergyDecaying(0.5), start, args, h=h, num_steps=20, throw=False
+        )
+
+    steps = jnp.array([0.01, 50.0, 0.02])
+    batch = jax.vmap(fn)(steps)
+    healthy = np.asarray(batch.result == ej.RESULTS.successful)
+    np.testing.assert_array_equal(healthy, [True, False, True])
+    assert batch.stats.completed_steps[1] < 20
+    for lane in (0, 2):
+        alone = fn(steps[lane])
+        # Solver: a batched program rounds differently.
+        np.testing.assert_allclose(batch.ys.q[lane], alone.ys.q, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(
+            batch.audit.dissipated[lane], alone.audit.dissipated, rtol=0, atol=1e-10
+        )
+
+
+def test_a_singular_step_is_a_failure_of_its_own():
+    """Two constraints that say the same leave their multipliers undetermined."""
+
+    def twice(q, args):
+        rod = q @ q - args["l"] ** 2
+        return jnp.stack([rod, rod])
+
+    single, start, args = problem("pendulum")
+    system = ej.System(single.kinetic, single.potential, twice)
+    out = ej.step(system, ej.EnergyPreserving(), start, args, h=0.01)
+    assert out.result != ej.RESULTS.successful
+
+
+def test_a_potential_that_leaves_its_domain_is_nonfinite():
+    system = ej.System(jnp.eye(1), lambda q, args: -args["k"] * jnp.sqrt(1.0 - q[0]))
+    solution = ej.simulate(
+        system,
+        ej.EnergyPreserving(),
+        ej.State([0.0], [1.0]),
+        dict(k=-1.0),
+        h=0.1,
+        num_steps=50,
+        throw=False,
+    )
+    assert failed(solution)
+    done = int(solution.stats.completed_steps)
+    assert 5 <= done < 50
+    # No row that counts as good holds what could not be evaluated.
+    assert np.all(np.isfinite(solution.audit.energy[: done + 1]))
+    assert np.all(solution.ys.q[: done + 1] < 1)
+
+
+def test_the_first_failure_is_kept():
+    """Later steps are skipped and cannot turn it into another."""
+    solution = run("stiff", "kappa", 0.5, 0.001)
+    done = int(solution.stats.completed_steps)
+    shorter = solve("stiff", "kappa", 0.5, h=0.001, steps=done + 1)
+    assert shorter.result == solution.result
+    assert int(shorter.stats.completed_steps) == done

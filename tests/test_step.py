@@ -1,0 +1,181 @@
+"""The step on its own, and what a run makes of it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import enerjax as ej
+
+from .helpers import problem, SCHEMES, solve
+
+
+# Round-off of a few hundred steps, compiled in another way.
+SAME = dict(rtol=0, atol=1e-12)
+H, STEPS = 0.01, 100
+
+
+@pytest.mark.parametrize("scheme", ["decaying", "consistent", "composed 4"])
+def test_a_loop_over_step_is_a_run(scheme):
+    system, start, args = problem("pendulum")
+    make = SCHEMES[scheme](0.5)
+    first = ej.step(system, make, start, args, h=H)
+
+    def one(carry, _):
+        state, warm = carry
+        out = ej.step(system, make, state, args, h=H, warm=warm)
+        return (out.state, out.warm), (out.state, out.dissipated, out.newton_iterations)
+
+    @jax.jit
+    def loop(carry):
+        return jax.lax.scan(one, carry, None, length=STEPS - 1)[1]
+
+    states, dissipated, iterations = loop((first.state, first.warm))
+    run = solve("pendulum", scheme, 0.5, h=H, steps=STEPS)
+    np.testing.assert_allclose(states.q, run.ys.q[2:], **SAME)
+    np.testing.assert_allclose(states.v, run.ys.v[2:], **SAME)
+    np.testing.assert_allclose(dissipated, run.audit.dissipated[2:], **SAME)
+    np.testing.assert_array_equal(iterations, run.stats.newton_iterations[1:])
+    np.testing.assert_allclose(first.state.q, run.ys.q[1], **SAME)
+
+
+def test_memory_of_the_steps_before_saves_iterations_and_changes_nothing():
+    system, start, args = problem("pendulum")
+    scheme = SCHEMES["preserving"](0.0)
+    warm, spent = None, [0, 0]
+    states = [start, start]
+    for _ in range(20):
+        outs = [
+            ej.step(system, scheme, states[0], args, h=0.02, warm=warm),
+            ej.step(system, scheme, states[1], args, h=0.02),
+        ]
+        warm = outs[0].warm
+        states = [out.state for out in outs]
+        spent = [n + int(out.newton_iterations) for n, out in zip(spent, outs, strict=True)]
+        np.testing.assert_allclose(states[0].q, states[1].q, **SAME)
+    assert spent[0] < spent[1]
+
+
+@pytest.mark.parametrize("save_every", [5, 100])
+def test_saving_less_is_thinning(save_every):
+    full = solve("pendulum", "decaying", 0.5, h=H, steps=STEPS)
+    thin = solve("pendulum", "decaying", 0.5, h=H, steps=STEPS, save_every=save_every)
+    np.testing.assert_allclose(thin.ys.q, full.ys.q[::save_every], **SAME)
+    np.testing.assert_allclose(thin.ys.v, full.ys.v[::save_every], **SAME)
+    np.testing.assert_allclose(thin.ts, full.ts[::save_every], rtol=1e-14)
+    np.testing.assert_allclose(thin.audit.energy, full.audit.energy[::save_every], **SAME)
+    # Multipliers are impulses over h: so is their round-off.
+    np.testing.assert_allclose(
+        thin.multipliers, full.multipliers[::save_every], rtol=0, atol=1e-9
+    )
+    # What is dissipated between two rows adds up; iterations are kept for every step.
+    sums = full.audit.dissipated[1:].reshape(-1, save_every).sum(axis=1)
+    np.testing.assert_allclose(thin.audit.dissipated[1:], sums, **SAME)
+    np.testing.assert_array_equal(
+        thin.stats.newton_iterations, full.stats.newton_iterations
+    )
+
+
+def test_a_run_has_the_shapes_it_promises():
+    solution = solve("pendulum", "kappa", 0.5, h=H, steps=STEPS, save_every=5)
+    times = STEPS // 5 + 1
+    assert solution.ts.shape == (times,)
+    assert solution.ys.q.shape == solution.ys.v.shape == (times, 2)
+    assert solution.multipliers.shape == (times, 1)
+    assert solution.details.shape == (times - 1,)
+    assert solution.audit.energy.shape == solution.audit.dissipated.shape == (times,)
+    assert solution.audit.constraint.shape == (times, 1)
+    assert solution.audit.constraint_rate.shape == (times, 1)
+    assert solution.stats.newton_iterations.shape == (STEPS,)
+    assert solution.stats.completed_steps == STEPS
+    start = problem("pendulum").start
+    np.testing.assert_array_equal(solution.ys.q[0], start.q)
+    np.testing.assert_array_equal(solution.ys.v[0], start.v)
+
+
+def test_multipliers_of_a_run_are_the_force_in_the_rod():
+    """2 lambda l is the pull of the rod: 3 m g cos(angle) after a start from rest."""
+    solution = solve("pendulum", "consistent", 0.0, h=H, steps=STEPS)
+    # A step's multiplier is its mean: compare it with the middle of the step.
+    middle = (solution.ys.q[1:, 1] + solution.ys.q[:-1, 1]) / 2
+    # Truncation, C h^2 with C of the order of g^2.
+    np.testing.assert_allclose(
+        2 * solution.multipliers[1:, 0], 3 * 9.81 * middle, rtol=0, atol=3e-2
+    )
+    assert abs(solution.multipliers[0, 0]) <= 1e-13
+
+
+REVERSIBLE = ["preserving", "consistent", "composed 4"]
+
+
+def there_and_back(scheme, alpha=0.0):
+    system, start, args = problem("double")
+    make = SCHEMES[scheme](alpha)
+    step = jax.jit(lambda y: ej.step(system, make, y, args, h=0.02).state)
+    # Away from rest first: there the way back would be the way there.
+    first = step(step(start))
+    last = step(step(first))
+    back = step(step(ej.State(last.q, -last.v)))
+    error = [np.max(np.abs(back.q - first.q)), np.max(np.abs(back.v + first.v))]
+    return max(error), np.max(np.abs(last.q - first.q))
+
+
+@pytest.mark.parametrize("scheme", REVERSIBLE)
+def test_symmetric_schemes_go_back_the_way_they_came(scheme):
+    """A composition does so by way of its own backward stages."""
+    error, way = there_and_back(scheme)
+    assert way > 1e-2
+    # Solver.
+    assert error <= 1e-12
+
+
+def test_dissipation_has_no_way_back():
+    error, _ = there_and_back("decaying", 1.0)
+    assert error > 1e-8
+
+
+@pytest.mark.parametrize("scheme", ["preserving", "consistent"])
+def test_a_step_of_minus_h_undoes_a_step_of_h(scheme):
+    """What the backward stages of a composition rest on."""
+    system, start, args = problem("double")
+    make = SCHEMES[scheme](0.0)
+    # Traced, so that the check for a positive step does not see it.
+    step = jax.jit(lambda y, h: ej.step(system, make, y, args, h=h).state)
+    first = step(start, 0.02)
+    again = step(step(first, 0.02), -0.02)
+    np.testing.assert_allclose(again.q, first.q, **SAME)
+    np.testing.assert_allclose(again.v, first.v, **SAME)
+
+
+def test_a_composition_is_its_stages_one_after_the_other():
+    system, start, args = problem("double")
+    composed = SCHEMES["composed 4"](0.0)
+    step = jax.jit(lambda y, h: ej.step(system, composed.stage, y, args, h=h))
+    state, impulse = start, 0.0
+    for length in composed.stages:
+        out = step(state, jnp.asarray(length * 0.02))
+        state, impulse = out.state, impulse + length * out.multipliers
+    whole = ej.step(system, composed, start, args, h=0.02)
+    np.testing.assert_allclose(whole.state.q, state.q, **SAME)
+    np.testing.assert_allclose(whole.state.v, state.v, **SAME)
+    # Round-off of an impulse over h.
+    np.testing.assert_allclose(whole.multipliers, impulse, rtol=0, atol=1e-9)
+
+
+def test_another_root_finder_can_be_given():
+    """The step equations are scaled, so a plain tolerance of a library does."""
+    import optimistix as optx
+
+    system, start, args = problem("pendulum")
+    run = ej.simulate(
+        system,
+        SCHEMES["preserving"](0.0),
+        start,
+        args,
+        h=H,
+        num_steps=20,
+        root_finder=optx.Newton(rtol=1e-12, atol=1e-12),
+    )
+    ours = solve("pendulum", "preserving", 0.0, h=H, steps=STEPS)
+    # Solver: its tolerance, over twenty steps.
+    np.testing.assert_allclose(run.ys.q, ours.ys.q[:21], rtol=0, atol=1e-9)
