@@ -2,14 +2,13 @@
 
 import functools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import enerjax as ej
 
-from .helpers import EPS, failed, problem, SCHEMES, solve, TURNOVER
+from .helpers import EPS, failed, on_host, problem, SCHEMES, solve, TURNOVER
 
 
 # Solver: Newton leaves a few eps of the energy in each step.
@@ -17,7 +16,13 @@ SOLVER = 1e-12
 
 ALPHAS = (0.0, 0.5, 1.0)
 SCHEMES_OF = {
-    "spring": ("preserving", "preserving gauss", "decaying", "decaying gauss", "consistent"),
+    "spring": (
+        "preserving",
+        "preserving gauss",
+        "decaying",
+        "decaying gauss",
+        "consistent",
+    ),
     "particles": ("preserving", "consistent"),
     "body": ("preserving", "decaying"),
 }
@@ -88,7 +93,7 @@ def concave(name, scheme, alpha):
     solution = ej.simulate(
         system, SCHEMES[scheme](alpha), start, args, h=h, num_steps=2000, throw=False
     )
-    return jax.device_get(solution)
+    return on_host(solution)
 
 
 @pytest.mark.parametrize("name", CONCAVE)
@@ -138,9 +143,7 @@ def test_a_fast_oscillation_shrinks_by_the_spectral_radius(scheme, rho_inf):
     make = {"decaying": ej.EnergyDecaying, "consistent": ej.EnergyConsistent}[scheme]
     system = ej.System(jnp.eye(1), lambda q, k: 0.5 * k * q @ q)
     start = ej.State([1.0], [0.0])
-    out = ej.step(
-        system, make.from_spectral_radius(rho_inf), start, stiffness, h=1.0
-    )
+    out = ej.step(system, make.from_spectral_radius(rho_inf), start, stiffness, h=1.0)
     energies = [system.energy(y, stiffness) for y in (start, out.state)]
     amplitude = float(jnp.sqrt(energies[1] / energies[0]))
     # Truncation in 1 / (h w), with h w = 1e5.

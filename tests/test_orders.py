@@ -35,8 +35,6 @@ def errors(name, scheme, alpha, steps):
     )
 
 
-
-
 FINE = (100, 200, 400, 800)
 COARSE = (12, 24, 48, 96)
 # name, scheme, alpha, order, allowed deviation, numbers of steps

@@ -1,5 +1,7 @@
 """The step on its own, and what a run makes of it."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +13,7 @@ from .helpers import problem, SCHEMES, solve
 
 
 # Round-off of a few hundred steps, compiled in another way.
-SAME = dict(rtol=0, atol=1e-12)
+SAME: dict[str, Any] = dict(rtol=0, atol=1e-12)
 H, STEPS = 0.01, 100
 
 

@@ -4,6 +4,11 @@ from . import problems as problems
 from ._audit import Audit as Audit
 from ._discrete import (
     AbstractDerivative as AbstractDerivative,
+    ChainRule as ChainRule,
+    discrete_fallbacks as discrete_fallbacks,
+    discrete_grad as discrete_grad,
+    discrete_jacobian as discrete_jacobian,
+    discrete_jvp as discrete_jvp,
     Gonzalez as Gonzalez,
     MeanValue as MeanValue,
 )

@@ -1,2 +1,9 @@
 from .base import AbstractDerivative as AbstractDerivative
+from .chain import (
+    ChainRule as ChainRule,
+    discrete_fallbacks as discrete_fallbacks,
+    discrete_grad as discrete_grad,
+    discrete_jacobian as discrete_jacobian,
+    discrete_jvp as discrete_jvp,
+)
 from .corrected import Gonzalez as Gonzalez, MeanValue as MeanValue

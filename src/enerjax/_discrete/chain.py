@@ -41,9 +41,9 @@ def discrete_grad(fn: Callable[..., Scalar]) -> Callable[..., PyTree[Array]]:
     """The discrete gradient of a scalar function, as a function of two points.
 
     `discrete_grad(fn)(a, b, *args)` is a pytree `D` like `a` with
-    `D . (b - a) = fn(b) - fn(a)` to round-off and `D = grad fn(a)` at `b = a`. Where `fn` is
-    a function of invariants of linear functions of its argument (distances of points), `D`
-    keeps the symmetry.
+    `D . (b - a) = fn(b) - fn(a)` to round-off and `D = grad fn(a)` at `b = a`. Where `fn`
+    is a function of invariants of linear functions of its argument (distances of points),
+    `D` keeps the symmetry.
 
     **Reference:** discrete gradients: O. Gonzalez (1996); by the chain rule for difference
     quotients, this library.

@@ -124,17 +124,6 @@ def absolute(a: Array, b: Array) -> Array:
     return jnp.where(ordinary, ratio, jnp.sign(a))
 
 
-def step(function: Callable[[Array], Array]) -> Quotient:
-    """Of a piecewise constant function: zero, or the true quotient across a step."""
-
-    def quotient(a: Array, b: Array) -> Array:
-        change = function(b) - function(a)
-        stepped = change != 0
-        return jnp.where(stepped, change / jnp.where(stepped, b - a, 1), 0)
-
-    return quotient
-
-
 def smooth(function: Callable[[Array], Array], reach: float) -> Quotient:
     """Of a smooth function without an addition theorem.
 
@@ -182,15 +171,15 @@ def _tanhc(x: Array) -> Array:
     return jnp.where(near, _sinhc(inner) / jnp.cosh(inner), jnp.tanh(outer) / outer)
 
 
-_sinc = _even(
-    [(-1) ** k / math.factorial(2 * k + 1) for k in range(10)],
-    lambda x: jnp.sin(x) / x,
-    0.5,
-)
-_sinhc = _even(
-    [1 / math.factorial(2 * k + 1) for k in range(10)], lambda x: jnp.sinh(x) / x, 0.5
-)
-_atanc = _even(
-    [(-1) ** k / (2 * k + 1) for k in range(16)], lambda x: jnp.arctan(x) / x, 0.3
-)
-_atanhc = _even([1 / (2 * k + 1) for k in range(16)], lambda x: jnp.arctanh(x) / x, 0.3)
+def _odd_factorials(sign: int) -> list[float]:
+    return [sign**k / math.factorial(2 * k + 1) for k in range(10)]
+
+
+def _odd_numbers(sign: int) -> list[float]:
+    return [sign**k / (2 * k + 1) for k in range(16)]
+
+
+_sinc = _even(_odd_factorials(-1), lambda x: jnp.sin(x) / x, 0.5)
+_sinhc = _even(_odd_factorials(1), lambda x: jnp.sinh(x) / x, 0.5)
+_atanc = _even(_odd_numbers(-1), lambda x: jnp.arctan(x) / x, 0.3)
+_atanhc = _even(_odd_numbers(1), lambda x: jnp.arctanh(x) / x, 0.3)

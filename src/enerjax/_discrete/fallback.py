@@ -1,9 +1,9 @@
 """The rule of a primitive that has none: its own corrected mean derivative.
 
-For this sub-function alone the increment is `J d + (change - J D) (D . d) / |D|^2`, with the
-differences `D` of all its moving operands, `change` of the output, and the derivative `J`
-averaged over the segment at two Gauss points. The bracket is dropped below the round-off of
-the output: there it holds no digit (see `corrected.py`, which states the bound).
+For this sub-function alone the increment is `J d + (change - J D) (D . d) / |D|^2`, with
+the differences `D` of all its moving operands, `change` of the output, and the derivative
+`J` averaged over the segment at two Gauss points. The bracket is dropped below the
+round-off of the output: there it holds no digit (`corrected.py` states the bound).
 """
 
 from typing import Any

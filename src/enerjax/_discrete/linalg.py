@@ -63,11 +63,10 @@ def triangular_solve(values: list[Value], params: dict[str, Any]) -> list[Value]
     (a,), (b,) = _ends(values, params)
     matrix, right = values
     lower, unit = params["lower"], params["unit_diagonal"]
-    used = (jnp.tril if lower else jnp.triu)(
-        jnp.ones(at_a(matrix).shape, bool), -1 * unit * lower
-    )
-    if unit and not lower:
-        used = jnp.triu(used, 1)
+    # The entries that the solve reads: without the diagonal where that counts as one.
+    offset = int(unit)
+    entries = jnp.ones(at_a(matrix).shape, bool)
+    used = jnp.tril(entries, -offset) if lower else jnp.triu(entries, offset)
     change = increment(right)
     if moves(matrix):
         moved = jnp.where(used, matrix.d, 0)

@@ -13,9 +13,11 @@ included. And because the map follows the user's own composition (differences of
 then dot products, then functions of distances), it inherits the symmetries that the program
 shows: a discrete gradient of a function of distances exerts no net force and no torque.
 
-**To add a rule:** write `rule(values, params)` in `rules.py` for the name that the primitive
-has in `jax.make_jaxpr`, from the helpers there. `values` has one entry an operand, plain
-where the operand is the same at `a` and `b`, else a `Moving`; return the same for each output.
+**To add a rule:** enter `rule(values, params)` in the table of `rules.py` under the name
+that the primitive has in `jax.make_jaxpr`, made with the helpers of `arithmetic.py`.
+`values` has one entry an operand, plain where the operand is the same at `a` and `b`, else
+a `Moving`; return the same for each output. `params` are those of the primitive, with the
+`primitive` itself and the `walk`.
 """
 
 from collections.abc import Callable
@@ -86,8 +88,14 @@ class Walk:
     def open(self, jaxpr: Any, consts: list[Value], inputs: list[Value]) -> list[Value]:
         """The outputs of a program for inputs that may move."""
         known: dict[Any, Value] = {}
-        read = lambda atom: atom.val if isinstance(atom, Literal) else known[atom]
-        known.update(zip(jaxpr.constvars, consts, strict=True))
+
+        def read(atom: Any) -> Value:
+            if isinstance(atom, Literal):
+                return jnp.asarray(atom.val, atom.aval.dtype)
+            return known[atom]
+
+        constants = [c if moves(c) else jnp.asarray(c) for c in consts]
+        known.update(zip(jaxpr.constvars, constants, strict=True))
         known.update(zip(jaxpr.invars, inputs, strict=True))
         for equation in jaxpr.eqns:
             values = [read(atom) for atom in equation.invars]

@@ -1,0 +1,196 @@
+"""Rules of sums, products, quotients, powers and elementary functions."""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._tracing import is_known
+from . import elementary
+from .transform import (
+    at_a,
+    at_b,
+    evaluate,
+    increment,
+    moves,
+    Moving,
+    NoRule,
+    Rule,
+    Switching,
+    Value,
+)
+
+
+def both(values: list[Value], params: dict[str, Any]) -> list[tuple[Array, Array]]:
+    """The outputs of a primitive at `a` and at `b`."""
+    params = dict(params)
+    primitive = params.pop("primitive")
+    params.pop("walk")
+    ends = [evaluate(primitive, list(map(at, values)), params) for at in (at_a, at_b)]
+    return list(zip(*ends, strict=True))
+
+
+def linear(*positions: int) -> Rule:
+    """Linear in the operands at `positions` together (in all, if none is named)."""
+
+    def rule(values: list[Value], params: dict[str, Any]) -> list[Value]:
+        linear = positions or range(len(values))
+        if any(moves(v) for k, v in enumerate(values) if k not in linear):
+            raise NoRule
+        params = dict(params)
+        primitive = params.pop("primitive")
+        params.pop("walk")
+
+        def push(part: Callable[[Value], Array]) -> list[Array]:
+            chosen = [part(v) if k in linear else v for k, v in enumerate(values)]
+            return evaluate(primitive, chosen, params)
+
+        ends = push(at_a), push(at_b)
+        if not any(isinstance(v, Switching) for v in values):
+            return list(map(Moving, *ends, push(increment)))
+        # Choices that are only moved about take along what decided them.
+        zero = lambda v: jnp.zeros(jnp.shape(v))
+        squares = push(lambda v: v.squares if isinstance(v, Switching) else zero(v))
+        decided = push(lambda v: v.decided if isinstance(v, Switching) else zero(v))
+        return list(map(Switching, *ends, squares, decided))
+
+    return rule
+
+
+def unary(quotient: elementary.Quotient) -> Rule:
+    """An elementary function of one operand."""
+
+    def rule(values: list[Value], params: dict[str, Any]) -> list[Value]:
+        (x,) = values
+        if not isinstance(x, Moving):
+            raise NoRule
+        ((a, b),) = both(values, params)
+        return [Moving(a, b, quotient(x.a, x.b) * x.d)]
+
+    return rule
+
+
+def rewritten(function: Callable[..., Array]) -> Rule:
+    """A function that is a composition of others with rules."""
+
+    def rule(values: list[Value], params: dict[str, Any]) -> list[Value]:
+        if any(isinstance(v, Switching) for v in values):
+            raise NoRule
+        program = jax.make_jaxpr(function)(*map(at_a, values))
+        (out,) = params["walk"].closed(program, values)
+        ((a, b),) = both(values, params)
+        return [Moving(a, b, out.d)]
+
+    return rule
+
+
+def product(values: list[Value], params: dict[str, Any]) -> list[Value]:
+    """Any bilinear operation: `mul` and `dot_general`."""
+    if any(isinstance(v, Switching) for v in values):
+        raise NoRule
+    params = dict(params)
+    primitive = params.pop("primitive")
+    params.pop("walk")
+    product = lambda x, y: evaluate(primitive, [x, y], params)[0]
+    u, v = values
+    a, b = product(at_a(u), at_a(v)), product(at_b(u), at_b(v))
+    terms = []
+    if moves(u):
+        terms.append(product(u.d, _mean(v)))
+    if moves(v):
+        terms.append(product(_mean(u), v.d))
+    return [Moving(a, b, sum(terms[1:], terms[0]))]
+
+
+def _mean(value: Value) -> Array:
+    return 0.5 * (value.a + value.b) if moves(value) else value
+
+
+def div(values: list[Value], params: dict[str, Any]) -> list[Value]:
+    if any(isinstance(v, Switching) for v in values):
+        raise NoRule
+    ((a, b),) = both(values, params)
+    u, v = values
+    if not moves(v):
+        return [Moving(a, b, u.d / v)]
+    change = increment(u) * _mean(v) - _mean(u) * v.d
+    return [Moving(a, b, change / (v.a * v.b))]
+
+
+def integer_pow(values: list[Value], params: dict[str, Any]) -> list[Value]:
+    n = params["y"]
+    return unary(lambda a, b: elementary.integer_pow(a, b, n))(values, params)
+
+
+def power(values: list[Value], params: dict[str, Any]) -> list[Value]:
+    x, y = values
+    if not moves(y) and jnp.ndim(y) == 0 and is_known(y):
+        twice = 2 * float(y)
+        if twice.is_integer() and abs(twice) <= 64:
+            n = int(twice)
+            root = lambda x, y: (
+                jax.lax.integer_pow(x, n // 2)
+                if n % 2 == 0
+                else (jax.lax.integer_pow(jnp.sqrt(x), n))
+            )
+            return rewritten(root)(values, params)
+    return rewritten(lambda x, y: jnp.exp(y * jnp.log(x)))(values, params)
+
+
+def extreme(sign: int) -> Rule:
+    """`max` (sign 1) and `min` (sign -1): the mean, and half the difference's `abs`."""
+
+    def rule(values: list[Value], params: dict[str, Any]) -> list[Value]:
+        if any(isinstance(v, Switching) for v in values):
+            raise NoRule
+        ((a, b),) = both(values, params)
+        x, y = values
+        lead = elementary.absolute(at_a(x) - at_a(y), at_b(x) - at_b(y))
+        dx, dy = increment(x), increment(y)
+        return [Moving(a, b, 0.5 * (dx + dy) + 0.5 * sign * lead * (dx - dy))]
+
+    return rule
+
+
+def reduce_extreme(pair: Callable[[Array, Array], Array]) -> Rule:
+    """Over the entries of short axes in pairs."""
+
+    def rule(values: list[Value], params: dict[str, Any]) -> list[Value]:
+        (x,) = values
+        axes = params["axes"]
+        if math.prod(x.a.shape[k] for k in axes) > 64:
+            raise NoRule
+
+        def reduce(v: Array) -> Array:
+            rows = jnp.moveaxis(v, axes, range(len(axes)))
+            rows = rows.reshape(-1, *rows.shape[len(axes) :])
+            return functools.reduce(pair, list(rows))
+
+        return rewritten(reduce)(values, params)
+
+    return rule
+
+
+def reduce_prod(values: list[Value], params: dict[str, Any]) -> list[Value]:
+    """Factor by factor: with `b` before the factor and `a` after it, and the other way."""
+    (x,) = values
+    ((a, b),) = both(values, params)
+    kept = [k for k in range(x.a.ndim) if k not in params["axes"]]
+    shape = [x.a.shape[k] for k in kept]
+    order = (*kept, *params["axes"])
+    xa, xb, d = (jnp.transpose(v, order).reshape(*shape, -1) for v in x)
+
+    def before(v: Array) -> Array:
+        return jnp.cumprod(
+            jnp.concatenate([jnp.ones_like(v[..., :1]), v[..., :-1]], -1), -1
+        )
+
+    def after(v: Array) -> Array:
+        return jnp.flip(before(jnp.flip(v, -1)), -1)
+
+    weights = 0.5 * (before(xb) * after(xa) + before(xa) * after(xb))
+    return [Moving(a, b, jnp.sum(weights * d, -1))]

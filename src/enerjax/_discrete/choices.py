@@ -1,0 +1,103 @@
+"""Rules of what chooses: comparisons, logic, selections, and the cut of an angle."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from . import elementary
+from .arithmetic import both, linear
+from .transform import at_a, at_b, increment, Moving, NoRule, Switching, Value
+
+
+def share(change: Array, squares: Array, decided: Array) -> Array:
+    """`change`, as a linear function of the increments of what decided it."""
+    happens = change != 0
+    weight = jnp.where(happens, change.astype(float) / jnp.where(happens, squares, 1), 0)
+    return (weight * decided).astype(change.dtype)
+
+
+def compare(values: list[Value], params: dict[str, Any]) -> list[Value]:
+    """Comparisons, logic and roundings to integers: values without an increment."""
+    outs = []
+    for a, b in both(values, params):
+        squares, decided = jnp.zeros(a.shape), jnp.zeros(a.shape)
+        for value in values:
+            if isinstance(value, Moving):
+                change, d = (value.b - value.a).astype(float), value.d.astype(float)
+                squares, decided = squares + change**2, decided + change * d
+            elif isinstance(value, Switching):
+                squares, decided = squares + value.squares, decided + value.decided
+        outs.append(Switching(a, b, squares, decided))
+    return outs
+
+
+def piecewise_constant(values: list[Value], params: dict[str, Any]) -> list[Value]:
+    """`floor` and its like: no increment, or the true quotient across a step."""
+    (x,) = values
+    if not isinstance(x, Moving):
+        raise NoRule
+    ((a, b),) = both(values, params)
+    change = x.b - x.a
+    return [Moving(a, b, share(b - a, change.astype(float) ** 2, change * x.d))]
+
+
+def sum_entries(values: list[Value], params: dict[str, Any]) -> list[Value]:
+    """Entry by entry: a sum of choices is decided by all of them."""
+    choices = any(isinstance(v, Switching) for v in values)
+    return compare(values, params) if choices else linear()(values, params)
+
+
+def convert(values: list[Value], params: dict[str, Any]) -> list[Value]:
+    (x,) = values
+    if not jnp.issubdtype(params["new_dtype"], jnp.inexact):
+        return compare(values, params)
+    if isinstance(x, Switching):
+        ((a, b),) = both(values, params)
+        return [Moving(a, b, share(b - a, x.squares, x.decided))]
+    return linear()(values, params)
+
+
+def select(values: list[Value], params: dict[str, Any]) -> list[Value]:
+    which, *cases = values
+    if not isinstance(which, Switching):
+        if any(isinstance(v, Switching) for v in cases):
+            raise NoRule
+        return linear(*range(1, len(values)))(values, params)
+    if any(isinstance(v, Switching) for v in cases):
+        raise NoRule
+    ((a, b),) = both(values, params)
+    if not jnp.issubdtype(a.dtype, jnp.inexact):
+        raise NoRule
+    increments = [increment(v) for v in cases]
+    exact = jax.lax.select_n(which.a, *increments)
+    mean = sum(increments[1:], increments[0]) / len(cases)
+    explained = sum((at_b(v) - at_a(v) for v in cases), jnp.zeros_like(a)) / len(cases)
+    same = which.a == which.b
+    rest = jnp.where(same, 0, b - a - explained)
+    shared = mean + share(rest, which.squares, which.decided)
+    return [Moving(a, b, jnp.where(same, exact, shared))]
+
+
+def reduce_logic(values: list[Value], params: dict[str, Any]) -> list[Value]:
+    (x,) = values
+    ((a, b),) = both(values, params)
+    decided = [jnp.sum(v, axis=params["axes"]) for v in (x.squares, x.decided)]
+    return [Switching(a, b, *decided)]
+
+
+def atan2(values: list[Value], params: dict[str, Any]) -> list[Value]:
+    if any(isinstance(v, Switching) for v in values):
+        raise NoRule
+    ((a, b),) = both(values, params)
+    (ya, xa), (yb, xb) = map(at_a, values), map(at_b, values)
+    dy, dx = map(increment, values)
+    cross, dot = xa * yb - ya * xb, xa * xb + ya * yb
+    mean_x, mean_y = 0.5 * (xa + xb), 0.5 * (ya + yb)
+    turned = elementary.angle_ratio(cross, dot) * (mean_x * dy - mean_y * dx)
+    # Across the branch cut the value jumps by a whole turn that no rotation explains.
+    cut = jnp.round((b - a - jnp.arctan2(cross, dot)) / (2 * jnp.pi)) * (2 * jnp.pi)
+    squares = ((yb - ya) ** 2 + (xb - xa) ** 2).astype(float)
+    decided = ((yb - ya) * dy + (xb - xa) * dx).astype(float)
+    return [Moving(a, b, turned + share(cut, squares, decided))]
