@@ -156,9 +156,7 @@ def _top_state(y: Vector, args: Args) -> tuple[Vector, Vector]:
 
 
 PENDULUM_ANGLE = Minimal(_horizontal, _swing, lambda y, args: (y[:1], y[1:]))
-PENDULUM = Minimal(
-    _horizontal, _swing, lambda y, args: _end_of_rod(y[0], y[1], args["l"])
-)
+PENDULUM = Minimal(_horizontal, _swing, lambda y, args: _end_of_rod(y[0], y[1], args["l"]))
 DOUBLE_PENDULUM = Minimal(
     lambda args: np.array([math.pi / 2, 0.0, 0.0, 0.0]), _double_swing, _double_state
 )

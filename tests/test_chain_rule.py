@@ -1,5 +1,7 @@
 """The chain rule for difference quotients: identity, symmetry, limits, no holes."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -122,11 +124,12 @@ def test_at_one_point_it_is_the_gradient_and_half_the_hessian(name):
     function = FUNCTIONS[name]
     gradient = lambda b: ej.discrete_grad(function)(POINT, b)
     exact = jax.grad(function)
-    close = dict(rtol=1e-10, atol=1e-10)  # round-off, with the curvature of the function
-    np.testing.assert_allclose(gradient(POINT), exact(POINT), **close)
+    # Round-off, with the curvature of the function.
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-10, atol=1e-10)
+    close(gradient(POINT), exact(POINT))
     half = 0.5 * jax.jacfwd(exact)(POINT)
-    np.testing.assert_allclose(jax.jacfwd(gradient)(POINT), half, **close)
-    np.testing.assert_allclose(jax.jacrev(gradient)(POINT), half, **close)
+    close(jax.jacfwd(gradient)(POINT), half)
+    close(jax.jacrev(gradient)(POINT), half)
     assert jnp.all(jnp.isfinite(jax.jacfwd(jax.jacfwd(gradient))(POINT)))
 
 
@@ -235,7 +238,8 @@ def test_the_preserving_scheme_keeps_angular_momentum_with_it():
         x, v = (y.reshape(-1, 4, 3) for y in (run.ys.q, run.ys.v))
         momentum = jnp.sum(args["m"][None, :, None] * jnp.cross(x, v), axis=1)
         energy = run.audit.energy
-        return jnp.max(jnp.abs(momentum - momentum[:1])), jnp.max(jnp.abs(energy - energy[0]))
+        size = lambda x: jnp.max(jnp.abs(x))
+        return size(momentum - momentum[:1]), size(energy - energy[0])
 
     momentum, energy = drift(ej.ChainRule())
     assert momentum <= 1e-12  # round-off of 300 steps, against |L| = 2.8
