@@ -91,7 +91,7 @@ class Walk:
 
         def read(atom: Any) -> Value:
             if isinstance(atom, Literal):
-                return jnp.asarray(atom.val, atom.aval.dtype)
+                return jnp.asarray(atom.val, atom.aval.dtype)  # pyright: ignore
             return known[atom]
 
         constants = [c if moves(c) else jnp.asarray(c) for c in consts]
