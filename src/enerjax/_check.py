@@ -1,10 +1,11 @@
 """Bad input, told before any step: what is wrong, why that is likely, what to do.
 
-Shapes and types are checked always. Values are checked where they are known, that is
-outside of `jit`, `vmap` and `grad`; inside, a bad value shows in the `result`.
+Shapes and types are checked always, values where they are known: outside of `jit`, `vmap`
+and `grad`.
 """
 
 import functools
+import operator
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -25,21 +26,37 @@ from ._types import Args, Real, Scalar
 def prepare(
     system: System, scheme: AbstractScheme, start: State, args: Args, h: Real
 ) -> tuple[State, Args, Scalar]:
-    """Checked start, `args` with arrays for leaves, and `h` in the dtype of the start."""
+    """Checked start, `args` of arrays, and `h` in the dtype of the start."""
     if not isinstance(scheme, AbstractScheme):
         raise TypeError(
-            f"`scheme` must be a scheme such as `EnergyPreserving()`, got {scheme!r}."
-            + (" Did you forget the parentheses?" if isinstance(scheme, type) else "")
+            f"`scheme` must be a scheme such as `EnergyPreserving()`, got {scheme!r}"
+            + (": the parentheses are missing." if isinstance(scheme, type) else ".")
         )
     start, args = check_system(system, start, args)
+    if any(jnp.ndim(x) > 0 for x in jax.tree.leaves(scheme)):
+        raise ValueError(
+            f"The numbers of the scheme must be scalars, got {scheme}. To sweep them put "
+            "the scheme inside `jax.vmap`."
+        )
+    if is_known(h) and np.ndim(h) == 0 and not 0 < float(np.real(h)) < np.inf:
+        raise ValueError(f"`h` must be positive and finite, got {h}.")
     h = jnp.asarray(h, start.q.dtype)
     if h.ndim != 0:
         raise ValueError(
             f"`h` must be a scalar, got shape {h.shape}. To sweep it use `jax.vmap`."
         )
-    if is_known(h) and not (h > 0 and jnp.isfinite(h)):
-        raise ValueError(f"`h` must be positive and finite, got {h}.")
     return start, args, h
+
+
+def positive_integer(name: str, count: Any) -> int:
+    """`count` as an `int`, from any integer type."""
+    try:
+        number = operator.index(count)
+    except TypeError:
+        number = 0
+    if number < 1 or isinstance(count, bool):
+        raise ValueError(f"`{name}` must be a positive integer, got {count!r}.")
+    return number
 
 
 def check_system(system: System, state: State, args: Args) -> tuple[State, Args]:
@@ -92,12 +109,14 @@ def _describe(role: str, fn: Any) -> str:
     return f"`{role}`" if name in (None, role, "<lambda>") else f"`{role}` (`{name}`)"
 
 
-def _shape(fn: Callable, *inputs: Any) -> tuple[int, ...]:
+def _shape(role: str, fn: Callable, *inputs: Any) -> tuple[int, ...]:
+    """Of the value of a function of the system, which must be a real array."""
     out = eqx.filter_eval_shape(fn, *inputs)
-    if not hasattr(out, "shape"):
+    if not hasattr(out, "shape") or not jnp.issubdtype(out.dtype, jnp.floating):
+        kind = out.dtype if hasattr(out, "dtype") else f"a Python {type(out).__name__}"
         raise TypeError(
-            f"A function of the system returned {type(out).__name__} where an array was "
-            "expected; build it with `jnp.array([...])`."
+            f"{_describe(role, fn)} must return a real JAX array, got {kind}. Write it "
+            "with `jax.numpy` from its arguments: `0.0 * q[0]` is a zero of the right kind."
         )
     return out.shape
 
@@ -117,7 +136,7 @@ def _check_shapes(system: System, state: State, args: Args) -> None:
         fn = getattr(system, role)
         if fn is None:
             continue
-        shape = _shape(fn, state.q, args)
+        shape = _shape(role, fn, state.q, args)
         if len(shape) != 1:
             raise ValueError(
                 f"{_describe(role, fn)} must return a vector, got shape {shape}. "
@@ -133,7 +152,7 @@ def _check_shapes(system: System, state: State, args: Args) -> None:
             )
         return
     fn = system.kinematics.matrix
-    shape = _shape(fn, state.q, args)
+    shape = _shape("kinematics", fn, state.q, args)
     if shape != (nv, nq):
         raise ValueError(
             f"{_describe('kinematics', fn)} returned shape {shape}; `v = L qdot` with "
@@ -148,7 +167,7 @@ def _check_shapes(system: System, state: State, args: Args) -> None:
 
 
 def _check_scalar(role: str, fn: Callable, x: Array, args: Args) -> None:
-    shape = _shape(fn, x, args)
+    shape = _shape(role, fn, x, args)
     if shape != ():
         raise ValueError(
             f"{_describe(role, fn)} must return a scalar, an energy, got shape {shape}."
@@ -174,38 +193,53 @@ def _facts(system: System, state: State, args: Args) -> dict[str, Array]:
     else:
         inertia = system.kinetic.astype(v.dtype)
         is_quadratic = jnp.array(True)
-    root = jnp.sqrt(jnp.diagonal(inertia))
+    masses, eps = jnp.diagonal(inertia), 1e3 * jnp.finfo(v.dtype).eps
+    root = jnp.sqrt(jnp.where(masses > 0, masses, 1))
     scaled = inertia / jnp.outer(root, root)
+    finite = lambda tree: jnp.all(
+        jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(tree)], bool)
+    )
+    constraints = (system.constraint, system.coordinate_constraint)
+    model = [f(state.q, args) for f in constraints if f is not None]
     return dict(
-        start=jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isfinite(v)),
-        potential=jnp.isfinite(system.potential(state.q, args)),
+        start=finite(state),
+        args=finite([x for x in jax.tree.leaves(args) if eqx.is_inexact_array(x)]),
+        potential=finite(system.potential(state.q, args)),
+        constraint=finite(model),
+        inertia=finite(inertia),
         quadratic=is_quadratic,
-        symmetric=jnp.max(jnp.abs(scaled - scaled.T)) <= 1e3 * jnp.finfo(v.dtype).eps,
-        definite=jnp.all(jnp.isfinite(jnp.linalg.cholesky(scaled))),
+        symmetric=jnp.all(jnp.abs(scaled - scaled.T) <= eps),
+        definite=jnp.all(masses > 0) & finite(jnp.linalg.cholesky(scaled)),
     )
 
 
 def _check_values(system: System, state: State, args: Args) -> None:
-    facts = jax.device_get(_facts(system, state, args))
+    facts = _facts(system, state, args)
+    if not is_known(facts):  # the functions of the system close over traced numbers
+        return
     kinetic = "inertia matrix"
     if callable(system.kinetic):
         kinetic = "inertia (the Hessian of " + _describe("kinetic", system.kinetic) + ")"
     potential = _describe("potential", system.potential)
     for name, message in (
         ("start", f"The start is not finite: q = {state.q}, v = {state.v}."),
+        ("args", f"`args` holds a number that is not finite: {args}."),
         (
             "potential",
             f"{potential} is not finite at the start, q = {state.q}. Is it defined there?",
         ),
+        ("constraint", "The constraints are not finite at the start. Defined there?"),
+        (
+            "inertia",
+            f"The {kinetic} is not finite. A kinetic energy must have second derivatives "
+            "at `v = 0`: write `v @ v`, not the square of a norm.",
+        ),
         (
             "quadratic",
-            f"{_describe('kinetic', system.kinetic)} is not quadratic in `v` with constant "
-            "inertia: it must be `1/2 v . M v`, with no linear or constant part.",
+            f"{_describe('kinetic', system.kinetic)} is not quadratic in `v` with "
+            "constant inertia: it must be `1/2 v . M v`, with no linear or constant part.",
         ),
-        (
-            "symmetric",
-            f"The {kinetic} is not symmetric (or not finite).",
-        ),
+        ("symmetric", f"The {kinetic} is not symmetric."),
         (
             "definite",
             f"The {kinetic} is not positive definite. A coordinate without mass, or a "

@@ -60,7 +60,7 @@ def consistent_start(
     - `system`: a `System`.
     - `q`, `v`: arrays or lists, `(nq,)` and `(nv,)`, close to the constraints: close
       enough for the linearised constraints to explain the error in `q`. (In numbers: a
-      second correction must be less than a quarter of the first.)
+      second correction must be less than a fifth of the first.)
     - `args`: handed to the functions of the system.
 
     **Returns:** a `ConsistentStart`.
@@ -161,7 +161,8 @@ def _linear(model: Model, metric: Float[Array, "nq nq"], q: Coordinates) -> Flag
     """Whether the linearised constraints explain the error at `q`.
 
     The natural monotonicity test of P. Deuflhard, Newton Methods for Nonlinear Problems
-    (2004): a simplified second correction shorter than a quarter of the first.
+    (2004): a simplified second correction shorter than a fifth of the first. (From
+    infinitely far from a sphere it is a quarter.)
     """
     jacobian = model.constraint_jacobian(q)
     flexible = jnp.linalg.solve(metric, jacobian.T)
@@ -172,7 +173,7 @@ def _linear(model: Model, metric: Float[Array, "nq nq"], q: Coordinates) -> Flag
     first = correction(model.constraint(q))
     second = correction(model.constraint(q - first))
     length = lambda x: jnp.sqrt(x @ metric @ x)
-    return length(second) <= 0.25 * length(first)
+    return length(second) <= 0.2 * length(first)
 
 
 def _project_velocity(model: Model, q: Coordinates, v: Velocities) -> Velocities:

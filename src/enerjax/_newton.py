@@ -40,11 +40,11 @@ _PATIENCE = 12
 class Newton(optx.AbstractRootFinder):
     """Newton's method on a problem scaled to order one, down to round-off.
 
-    Stops after the correction that was computed from a residual of round-off size, or
-    whose error, predicted from the quadratic convergence of the corrections `c_k`, is:
-    the next one would be about `c_k (c_k / c_{k-1})^2`. Every residual is evaluated
-    together with its Jacobian, none only to find that it is small, and the second test
-    does not ask for a residual below what `fn` can resolve.
+    Stops after a small correction that was computed from a residual of round-off size, or
+    after one whose error, predicted from the quadratic convergence of the corrections
+    `c_k`, is: the next one would be about `c_k (c_k / c_{k-1})^2`. Every residual is
+    evaluated together with its Jacobian, none only to find that it is small, and the
+    second test does not ask for a residual below what `fn` can resolve.
 
     An iteration that breaks down, or has not converged after 12 corrections, begins
     again from `options["second_guess"]` if that is given.
@@ -77,17 +77,21 @@ class Newton(optx.AbstractRootFinder):
 
         jacobian, (value, aux) = jax.jacfwd(flat_fn, has_aux=True)(flat)
         correction = jnp.linalg.solve(jacobian, value)
-        size, residual = self.norm(correction), self.norm(value)
+        eps = jnp.finfo(value.dtype).eps
+        # Each unknown against itself: one scale for all would hide a light, slow body
+        # beside a heavy, fast one. The floor is for unknowns that pass through zero.
+        own = jnp.abs(flat - correction) + eps**0.125
+        size, residual = self.norm(correction / own), self.norm(value)
         contraction = size / state.correction
-        # Before the second correction nothing is known of the curvature: its size must do.
-        predicted = jnp.where(
-            jnp.isinf(state.correction), 1e2 * size**2, size * contraction**2
-        )
-        eps = jnp.finfo(size.dtype).eps
-        quadratic = (contraction < 0.1) & (predicted <= self.rtol * eps)
+        # Nothing is known of the curvature before the second correction.
+        known = jnp.isfinite(state.correction) & (contraction < 0.1)
+        quadratic = known & (size * contraction**2 <= self.rtol * eps)
+        small = (residual <= self.atol * eps) & (size <= eps**0.25)
         # A singular Jacobian leaves the correction without a value, however small the
         # residual is: that is no solution, and shows in the next iterate.
-        done = (quadratic | (residual <= self.atol * eps)) & jnp.isfinite(size)
+        # Coordinates far from the origin are too coarse for the rates to settle further.
+        stagnated = (state.correction <= eps**0.25) & (size > 0.6 * state.correction)
+        done = (quadratic | small | stagnated) & jnp.isfinite(size)
         count, flat = state.count + 1, flat - correction
         if options.get("second_guess") is not None:
             lost = ~jnp.isfinite(size) | (count == _PATIENCE)

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import optimistix as optx
 
 from ._audit import audit
-from ._check import prepare
+from ._check import positive_integer, prepare
 from ._model import Model
 from ._newton import Newton
 from ._results import first_failure, RESULTS
@@ -57,17 +57,17 @@ def simulate(
       again instead of stored.
     - `root_finder`: an optimistix root finder for the step equations, which are scaled
       to order one (so tolerances are relative).
-    - `throw`: raise an error at the end of a run that failed, which names the step and
-      the cause. With `False` look at `result`: rows after the failure are NaN.
+    - `throw`: raise an error at the end of a run that failed, which names the step, the
+      time and the cause (under `jit`, `vmap` and `grad` the cause alone, and for all
+      lanes together). With `False` look at `result`: rows after the failure are NaN.
 
     **Returns:** a `Solution`.
 
     **Raises:** `ValueError` or `TypeError` for bad input, before any step;
     `equinox.EquinoxRuntimeError` for a failed run if `throw`.
     """
-    for name, count in (("num_steps", num_steps), ("save_every", save_every)):
-        if not isinstance(count, int) or isinstance(count, bool) or count < 1:
-            raise ValueError(f"`{name}` must be a positive integer, got {count!r}.")
+    num_steps = positive_integer("num_steps", num_steps)
+    save_every = positive_integer("save_every", save_every)
     if num_steps % save_every != 0:
         raise ValueError(
             f"`num_steps` ({num_steps}) must be a multiple of `save_every` ({save_every})."
@@ -140,18 +140,19 @@ def _nan_unless(good: Flag, tree):
 
 
 def _check_start(scheme: AbstractScheme, model: Model, start: State, h: Scalar) -> RESULTS:
-    """Whether the start satisfies what the scheme holds, to half the digits.
+    """Whether the start satisfies what the scheme holds, to half the digits of a step.
 
     An error there would stay in the energy balance of the first step. The measure is
-    the motion or velocity that would repair it, against the sizes of the motion.
+    the motion or velocity that would repair it, against those of a step, wherever the
+    origin lies.
     """
     scales = model.scales
     root = jnp.sqrt(model.energy_scale(start, h))
     # NaN compares false: a start that cannot be measured fails at its first step.
     tolerance = jnp.sqrt(jnp.finfo(h.dtype).eps)
     position = jnp.abs(model.constraint(start.q))
-    length = jnp.max(jnp.abs(start.q) * scales.coordinate) + h * root
-    far = position > 1e2 * tolerance * (length * scales.constraint + scales.constraint_size)
+    rounding = 1e3 * jnp.finfo(h.dtype).eps * scales.constraint_size
+    far = position > 1e2 * tolerance * h * root * scales.constraint + rounding
     bad = jnp.any(far)
     if scheme.stage.formulation == "ggl":
         rate = jnp.abs(model.joint_rate(start.q, start.v))

@@ -37,7 +37,8 @@ def _corrected(
     fn_a, fn_b = fn(a), fn(b)
     defect = fn_b - fn_a - mean @ d
     size = abs(fn_a) + abs(fn_b) + abs(mean) @ (abs(a) + abs(b))
-    holds_digits = abs(defect) > jnp.finfo(a.dtype).eps * size
+    # So written, a value that is not a number holds: it must show in the step.
+    holds_digits = ~(abs(defect) <= jnp.finfo(a.dtype).eps * size)
     # Both operands of the quotient are guarded: under autodiff the branch that `where`
     # does not take is multiplied by zero, and must be finite for that.
     length2 = jnp.where(holds_digits, d @ d, 1.0)
@@ -48,7 +49,7 @@ class Gonzalez(AbstractDerivative):
     """Gonzalez' midpoint discrete gradient: one gradient and two evaluations.
 
     Second-order accurate; exact midpoint gradient for quadratic functions. Keeps no
-    symmetry of `fn`: angular momentum is conserved to second order only.
+    symmetry of `fn`: momenta are conserved to second order only.
 
     **Reference:** O. Gonzalez, Time integration and discrete Hamiltonian systems,
     J. Nonlinear Sci. 6 (1996) 449-467.

@@ -50,7 +50,7 @@ def fallback(primitive: Any, values: list[Value], params: dict[str, Any]) -> lis
         mean = 0.5 * (jacobians[0][k] + jacobians[1][k])
         defect = b - a - mean @ (end - start)
         size = jnp.abs(a) + jnp.abs(b) + jnp.abs(mean) @ (jnp.abs(start) + jnp.abs(end))
-        holds_digits = jnp.abs(defect) > jnp.finfo(a.dtype).eps * size
+        holds_digits = ~(jnp.abs(defect) <= jnp.finfo(a.dtype).eps * size)
         share = jnp.where(holds_digits, defect, 0) / jnp.where(squares > 0, squares, 1)
         outs.append(Moving(a, b, mean @ d + share * decided))
     return outs

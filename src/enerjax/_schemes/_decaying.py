@@ -1,6 +1,7 @@
 """What the discontinuous schemes have in common."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from .._segment import Increment
@@ -19,8 +20,8 @@ class JumpAndEnd(eqx.Module):
 
 def as_alpha(alpha: Real) -> Scalar:
     """Checks a dissipation parameter where its value can be known."""
-    alpha = jnp.asarray(alpha, float)
-    if is_known(alpha) and not jnp.all((alpha >= 0) & (alpha <= 1)):
+    alpha, inside = _unit_interval(alpha)
+    if not inside:
         raise ValueError(
             f"alpha = {alpha} lies outside [0, 1]: 0 preserves the energy, 1 annihilates "
             "the highest frequencies in one step; beyond, the scheme would feed energy in."
@@ -28,10 +29,20 @@ def as_alpha(alpha: Real) -> Scalar:
     return alpha
 
 
+def _unit_interval(number: Real) -> tuple[Scalar, bool]:
+    """A number as an array, and whether it may lie in [0, 1] as far as is known."""
+    if not is_known(number):
+        return jnp.asarray(number, float), True
+    # A constant keeps its value inside `jit` too.
+    with jax.ensure_compile_time_eval():
+        array = jnp.asarray(number, float)
+        return array, bool(jnp.all((array >= 0) & (array <= 1)))
+
+
 def alpha_from_spectral_radius(rho_inf: Real) -> Scalar:
     """`alpha = (1 - rho_inf) / (1 + rho_inf)`"""
-    rho_inf = jnp.asarray(rho_inf, float)
-    if is_known(rho_inf) and not jnp.all((rho_inf >= 0) & (rho_inf <= 1)):
+    rho_inf, inside = _unit_interval(rho_inf)
+    if not inside:
         raise ValueError(
             f"rho_inf = {rho_inf} lies outside [0, 1]: it is the factor by which a step "
             "multiplies the amplitude of an infinitely fast oscillation."

@@ -1,6 +1,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._discrete import AbstractDerivative, MeanValue
@@ -43,7 +44,8 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
 
     - Conserves: energy, to round-off, at `alpha = 0`.
     - Dissipates: `alpha/2 j . P j >= 0` in every step, also where `V` is not convex. On a
-      linear oscillator `rho_inf = (1 - alpha) / (1 + alpha)`.
+      linear oscillator `rho_inf = (1 - alpha) / (1 + alpha)`. Where the stiffness has no
+      positive part there is nothing to damp, and nothing is removed.
     - Constraints held at: position and velocity level.
     - Order: 4 at `alpha = 0` (then symmetric: `Composed` raises it to 6 or 8), else 3;
       2 where the `derivative` is `Gonzalez()` and `V` is not quadratic.
@@ -81,7 +83,8 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
 
     @property
     def symmetric(self) -> bool:
-        return is_known(self.alpha) and bool(jnp.all(self.alpha == 0))
+        # In NumPy: under `jit` a comparison of JAX arrays would be traced.
+        return is_known(self.alpha) and bool(np.all(np.asarray(self.alpha) == 0))
 
     @property
     def order(self) -> int:

@@ -21,8 +21,8 @@ from .base import AbstractSingleSolve, Formulation, StepEnd, StepProblem
 
 class _Unknowns(eqx.Module):
     nodes: JumpAndEnd
-    # Of length 0 without joints: kappa is then 1 by construction.
-    kappa: Float[Array, " 0or1"]
+    # One entry, or none without joints: kappa is then 1 by construction.
+    kappa: Float[Array, " nk"]
 
 
 class KappaDecaying(AbstractSingleSolve[_Unknowns, StepProblem]):
@@ -102,7 +102,8 @@ class KappaDecaying(AbstractSingleSolve[_Unknowns, StepProblem]):
         jump, end = self._nodes(z, problem)
         kinetic, potential = jump_energy(problem, jump)
         kappa = _kappa(z)
-        bounded = (kappa > 0) & (kappa < 2)
+        # A kappa without value comes from an iterate that broke down for other reasons.
+        bounded = ((kappa > 0) & (kappa < 2)) | ~jnp.isfinite(kappa)
         return StepEnd(
             end,
             z.nodes.end.impulse / problem.h,
@@ -113,7 +114,7 @@ class KappaDecaying(AbstractSingleSolve[_Unknowns, StepProblem]):
 
     def _kappa_row(
         self, z: _Unknowns, problem: StepProblem, jump: State, end: State
-    ) -> Float[Array, " 0or1"]:
+    ) -> Float[Array, " nk"]:
         """eq. (70, 71), multiplied out, over an energy of the step."""
         if z.kappa.size == 0:
             return z.kappa

@@ -103,7 +103,7 @@ def chain(num_links: int, length: Real = 1.0, mass: Real = 1.0, g: Real = 9.81) 
     """
     each = jnp.full((num_links,), 1 / num_links)
     args = dict(m=mass * each, l=length * each, g=g)
-    x = length * jnp.arange(1, num_links + 1) / num_links
+    x = length * jnp.arange(1, num_links + 1, dtype=float) / num_links
     q = jnp.stack([x, jnp.zeros_like(x)], axis=1).reshape(-1)
     system = System(_chain_kinetic, _chain_potential, _chain_rods)
     return problem(system, q, jnp.zeros_like(q), args)
