@@ -22,7 +22,7 @@ LAYERS = [
     {"_discrete", "_kinematics", "_newton"},
     {"_system"},
     {"_model"},
-    {"_segment", "_audit"},
+    {"_audit"},
     {"_schemes", "_scaling", "_solution"},
     {"_check"},
     {"_step", "_initial"},

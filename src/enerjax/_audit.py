@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
-from ._model import Model
+from ._model import AbstractModel
 from ._system import State
 
 
@@ -31,13 +31,13 @@ class Audit(eqx.Module):
         return self.kinetic + self.potential
 
 
-def audit(model: Model, states: State, dissipated: Float[Array, " times"]) -> Audit:
+def audit(model: AbstractModel, states: State, dissipated: Float[Array, " times"]) -> Audit:
     """The audit of states with a leading time axis."""
 
     def at(state: State):
         return (
-            model.kinetic(state.v),
-            model.potential(state.q),
+            model.kinetic(state),
+            model.potential(state),
             model.constraint(state.q),
             model.joint_rate(state.q, state.v),
         )

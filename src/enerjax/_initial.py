@@ -9,9 +9,9 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from ._check import check_system
-from ._model import Model
+from ._model import AbstractModel, make_model
 from ._newton import find_root, Newton
-from ._system import State, System
+from ._system import AbstractSystem, HamiltonianSystem, State
 from ._tracing import is_known
 from ._types import Args, Coordinates, Count, Flag, Multipliers, Vector, Velocities
 
@@ -36,7 +36,7 @@ class ConsistentStart(eqx.Module):
     rate_after: Float[Array, " nj"]
 
 
-def initial_state(system: System, q: Vector, v: Vector, args: Args = None) -> State:
+def initial_state(system: AbstractSystem, q: Vector, v: Vector, args: Args = None) -> State:
     """The `State` nearest to `(q, v)` that satisfies the constraints.
 
     As `consistent_start`, of which it returns the state alone.
@@ -45,7 +45,7 @@ def initial_state(system: System, q: Vector, v: Vector, args: Args = None) -> St
 
 
 def consistent_start(
-    system: System, q: Vector, v: Vector, args: Args = None
+    system: AbstractSystem, q: Vector, v: Vector, args: Args = None
 ) -> ConsistentStart:
     """Projects a start onto the constraints and solves for what is in balance there.
 
@@ -104,22 +104,24 @@ def _raise_unless(
 
 @eqx.filter_jit
 def _project(
-    system: System, guess: State, args: Args
+    system: AbstractSystem, guess: State, args: Args
 ) -> tuple[ConsistentStart, Flag, Count]:
-    model = Model(system, guess, args)
+    model = make_model(system, guess, args)
     before = model.constraint(guess.q)
-    q, near = _project_position(model, guess.q)
-    v = _project_velocity(model, q, guess.v)
-    state = State(q, v)
+    q, near = _project_position(model, guess)
+    given = model.enter(State(q, guess.v))
+    state = State(q, _project_velocity(model, given))
     acceleration, multipliers = model.accelerations(state)
+    rates = State(model.lift(q, state.v), acceleration)
+    user_state, user_rates = jax.jvp(model.leave, (state,), (rates,))
     start = ConsistentStart(
-        state,
-        acceleration,
+        user_state,
+        user_rates.v,
         multipliers,
         before,
         model.constraint(q),
-        model.joint_rate(q, guess.v),
-        model.joint_rate(q, v),
+        model.joint_rate(q, given.v),
+        model.joint_rate(q, state.v),
     )
     jacobian = jax.lax.stop_gradient(model.constraint_jacobian(q))
     unit = jacobian / model.scales.coordinate[None, :] / model.scales.constraint[:, None]
@@ -127,11 +129,12 @@ def _project(
     return start, near, rank
 
 
-def _project_position(model: Model, guess: Coordinates) -> tuple[Coordinates, Flag]:
+def _project_position(model: AbstractModel, state: State) -> tuple[Coordinates, Flag]:
     """The nearest configuration on the constraints, and whether it could be found."""
+    guess = state.q
     if model.constraint(guess).size == 0:
         return guess, jnp.array(True)
-    metric, scales = model.metric(guess), model.scales
+    metric, scales = model.metric(model.enter(state)), model.scales
     size = jnp.max(jnp.abs(guess) * scales.coordinate)
     size = jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
 
@@ -157,7 +160,7 @@ def _project_position(model: Model, guess: Coordinates) -> tuple[Coordinates, Fl
     return q, near
 
 
-def _linear(model: Model, metric: Float[Array, "nq nq"], q: Coordinates) -> Flag:
+def _linear(model: AbstractModel, metric: Float[Array, "nq nq"], q: Coordinates) -> Flag:
     """Whether the linearised constraints explain the error at `q`.
 
     The natural monotonicity test of P. Deuflhard, Newton Methods for Nonlinear Problems
@@ -176,10 +179,18 @@ def _linear(model: Model, metric: Float[Array, "nq nq"], q: Coordinates) -> Flag
     return length(second) <= 0.2 * length(first)
 
 
-def _project_velocity(model: Model, q: Coordinates, v: Velocities) -> Velocities:
-    rate = model.joint_rate(q, v)
-    if rate.size == 0:
+def _project_velocity(model: AbstractModel, state: State) -> Velocities:
+    """The nearest velocities (or momenta) that the joints admit."""
+    q, v = state.q, state.v
+    if model.joint(q).size == 0:
         return v
-    jacobian = jax.jacfwd(model.joint_rate, argnums=1)(q, v)
-    flexible = model.inverse_inertia @ jacobian.T
-    return v - flexible @ jnp.linalg.solve(jacobian @ flexible, rate)
+
+    def correct(v: Velocities, _) -> tuple[Velocities, None]:
+        jacobian = jax.jacfwd(model.joint_rate, argnums=1)(q, v)
+        flexible = model.mobility(State(q, v)) @ jacobian.T
+        rate = model.joint_rate(q, v)
+        return v - flexible @ jnp.linalg.solve(jacobian @ flexible, rate), None
+
+    # Exact at once where the energy is a quadratic form of the momenta; else Newton.
+    corrections = 8 if isinstance(model.system, HamiltonianSystem) else 1
+    return jax.lax.scan(correct, v, None, length=corrections)[0]

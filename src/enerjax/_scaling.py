@@ -6,14 +6,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from ._model import Model
-from ._segment import Increment
+from ._model import AbstractModel, Increment
 from ._system import State
 from ._types import Scalar
 
 
 def scales_like(
-    z: PyTree[Any], model: Model, start: State, h: Scalar
+    z: PyTree[Any], model: AbstractModel, start: State, h: Scalar
 ) -> tuple[PyTree[Any], PyTree[Any]]:
     """The sizes of the unknowns in `z`, and of the rows that stand in their places."""
     scales = model.scales
@@ -24,7 +23,9 @@ def scales_like(
         if not is_increment(x):
             return jnp.ones_like(x)
         joint = scales.constraint[: x.velocity_impulse.size]
-        return Increment(root / scales.coordinate, root / scales.constraint, root / joint)
+        rate = root / scales.coordinate
+        momentum = (root * scales.coordinate)[: x.momentum.size]
+        return Increment(rate, momentum, root / scales.constraint, root / joint)
 
     def row(x):
         if not is_increment(x):
@@ -33,6 +34,8 @@ def scales_like(
         # A constraint is a difference of numbers that can be large against what a step
         # changes: its rows are resolved to the round-off of those.
         position = root * scales.constraint + scales.constraint_size / jnp.abs(h)
-        return Increment(root * scales.coordinate, position, root * joint)
+        momentum = root * scales.coordinate
+        rate = (root / scales.coordinate)[: x.momentum.size]
+        return Increment(momentum, rate, position, root * joint)
 
     return tuple(jax.tree.map(f, z, is_leaf=is_increment) for f in (unknown, row))  # pyright: ignore

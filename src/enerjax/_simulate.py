@@ -5,13 +5,13 @@ import optimistix as optx
 
 from ._audit import audit
 from ._check import positive_integer, prepare
-from ._model import Model
+from ._model import AbstractModel, make_model
 from ._newton import Newton
 from ._results import first_failure, RESULTS
 from ._schemes import AbstractScheme
 from ._solution import Solution, Statistics
 from ._step import advance, first_warm, Warm
-from ._system import State, System
+from ._system import AbstractSystem, State
 from ._tracing import is_known
 from ._types import Args, Count, Flag, Real, Scalar
 
@@ -26,7 +26,7 @@ class _Carry(eqx.Module):
 
 
 def simulate(
-    system: System,
+    system: AbstractSystem,
     scheme: AbstractScheme,
     start: State,
     args: Args = None,
@@ -79,7 +79,8 @@ def simulate(
 
 @eqx.filter_jit
 def _run(system, scheme, start, args, h, root_finder, num_steps, save_every):
-    model = Model(system, start, args)
+    model = make_model(system, start, args)
+    start = model.enter(start)
     acceleration, multipliers0 = model.accelerations(start)
     warm = first_warm(scheme, model, start, h, acceleration, multipliers0)
 
@@ -122,7 +123,7 @@ def _run(system, scheme, start, args, h, root_finder, num_steps, save_every):
     times = h * jnp.arange(0, num_steps + 1, save_every, dtype=h.dtype)
     return Solution(
         times,
-        states,
+        jax.vmap(model.leave)(states),
         multipliers,
         details,
         audit(model, states, dissipated),
@@ -139,7 +140,9 @@ def _nan_unless(good: Flag, tree):
     return jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), tree)
 
 
-def _check_start(scheme: AbstractScheme, model: Model, start: State, h: Scalar) -> RESULTS:
+def _check_start(
+    scheme: AbstractScheme, model: AbstractModel, start: State, h: Scalar
+) -> RESULTS:
     """Whether the start satisfies what the scheme holds, to half the digits of a step.
 
     An error there would stay in the energy balance of the first step. The measure is

@@ -14,12 +14,12 @@ import optimistix as optx
 from jaxtyping import PyTree
 
 from ._check import prepare
-from ._model import Model
+from ._model import AbstractModel, make_model
 from ._newton import find_root, max_norm, Newton
 from ._results import first_failure, from_root_finder, RESULTS
 from ._scaling import scales_like
 from ._schemes import AbstractScheme, AbstractSingleSolve
-from ._system import State, System
+from ._system import AbstractSystem, State
 from ._types import Args, Count, Flag, Multipliers, Real, Scalar, Velocities
 
 
@@ -59,7 +59,7 @@ class StepOutput(eqx.Module):
 
 def first_warm(
     scheme: AbstractScheme,
-    model: Model,
+    model: AbstractModel,
     start: State,
     h: Scalar,
     acceleration: Velocities,
@@ -79,7 +79,7 @@ def first_warm(
 
 def advance(
     scheme: AbstractScheme,
-    model: Model,
+    model: AbstractModel,
     start: State,
     h: Scalar,
     warm: Warm,
@@ -113,14 +113,16 @@ def advance(
 
 @eqx.filter_jit
 def _single_step(system, scheme, state, args, h, warm, root_finder):
-    model = Model(system, state, args)
+    model = make_model(system, state, args)
+    state = model.enter(state)
     if warm is None:
         warm = first_warm(scheme, model, state, h, *model.accelerations(state))
-    return advance(scheme, model, state, h, warm, root_finder, jnp.array(False))
+    out = advance(scheme, model, state, h, warm, root_finder, jnp.array(False))
+    return eqx.tree_at(lambda out: out.state, out, model.leave(out.state))
 
 
 def step(
-    system: System,
+    system: AbstractSystem,
     scheme: AbstractScheme,
     state: State,
     args: Args = None,
@@ -154,7 +156,7 @@ def step(
 
 def _solve(
     scheme: AbstractSingleSolve,
-    model: Model,
+    model: AbstractModel,
     start: State,
     h: Scalar,
     memory: PyTree[Any],
@@ -204,7 +206,7 @@ def _solve(
 
 
 def _free_flight(
-    scheme: AbstractSingleSolve, problem: Any, model: Model, start: State
+    scheme: AbstractSingleSolve, problem: Any, model: AbstractModel, start: State
 ) -> PyTree[Any]:
     """The unknowns of a step in which no force acts."""
     num_constraints = jax.eval_shape(model.constraint, start.q).shape[0]

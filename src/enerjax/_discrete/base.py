@@ -20,6 +20,15 @@ class AbstractDerivative(eqx.Module):
 
     @abc.abstractmethod
     def gradient(
-        self, fn: Callable[[Coordinates], Scalar], a: Coordinates, b: Coordinates
+        self,
+        fn: Callable[[Coordinates], Scalar],
+        a: Coordinates,
+        b: Coordinates,
+        *,
+        weights: Coordinates | float = 1.0,
     ) -> Coordinates:
-        """The discrete gradient of the scalar function `fn` between `a` and `b`."""
+        """The discrete gradient of the scalar function `fn` between `a` and `b`.
+
+        `weights` are what squares of the increments are weighted with in the norm of a
+        correction: they matter where the entries have different units.
+        """

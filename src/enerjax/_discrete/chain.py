@@ -34,7 +34,8 @@ def discrete_jvp(
     **Raises:** `TypeError` if `a` and `b` differ in structure, shape or dtype, or are not
     real.
     """
-    return _trace(fn, a, b, args)[0]
+    push = _traced(fn, a, b, args)
+    return lambda d: push(d, Walk(RULES, fallback))
 
 
 def discrete_grad(fn: Callable[..., Scalar]) -> Callable[..., PyTree[Array]]:
@@ -82,10 +83,20 @@ def discrete_fallbacks(fn: Callable[..., PyTree[Array]]) -> Callable[..., list[s
     For each of them the discrete derivative is that of the corrected mean value, of that
     primitive alone. Empty where all is exact.
     """
-    return lambda a, b, *args: _trace(fn, a, b, args)[1]
+
+    def fallbacks(a: PyTree[Array], b: PyTree[Array], *args: Any) -> list[str]:
+        walk = Walk(RULES, fallback)
+        push = _traced(fn, a, b, args)
+        jax.eval_shape(lambda d: push(d, walk), a)
+        return walk.fallbacks
+
+    return fallbacks
 
 
-def _trace(fn: Callable, a: PyTree[Array], b: PyTree[Array], args: tuple):
+def _traced(
+    fn: Callable, a: PyTree[Array], b: PyTree[Array], args: tuple
+) -> Callable[[PyTree[Array], Walk], PyTree[Array]]:
+    """The increment of the output for one of the input, by a walk."""
     a, b = (jax.tree.map(jnp.asarray, x) for x in (a, b))
     flat_a, structure = jax.tree.flatten(a)
     flat_b, structure_b = jax.tree.flatten(b)
@@ -102,9 +113,7 @@ def _trace(fn: Callable, a: PyTree[Array], b: PyTree[Array], args: tuple):
         outs = walk.closed(program, inputs)
         return out_structure.unflatten([increment(x) for x in outs])
 
-    probe = Walk(RULES, fallback)
-    jax.eval_shape(lambda d: push(d, probe), a)
-    return (lambda d: push(d, Walk(RULES, fallback))), probe.fallbacks
+    return push
 
 
 class ChainRule(AbstractDerivative):
@@ -115,6 +124,12 @@ class ChainRule(AbstractDerivative):
     """
 
     def gradient(
-        self, fn: Callable[[Coordinates], Scalar], a: Coordinates, b: Coordinates
+        self,
+        fn: Callable[[Coordinates], Scalar],
+        a: Coordinates,
+        b: Coordinates,
+        *,
+        weights: Coordinates | float = 1.0,
     ) -> Coordinates:
+        del weights  # no correction
         return discrete_grad(fn)(a, b)

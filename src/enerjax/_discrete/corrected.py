@@ -1,9 +1,10 @@
 """Discrete gradients that correct a mean gradient along the increment.
 
-Both forms are `g + c d` with `d = b - a`, a mean gradient `g`, and the scalar `c` that
-makes the directionality exact:
+Both forms are `g + c W d` with `d = b - a`, a mean gradient `g`, the weights `W` of the
+entries (one, unless they have different units), and the scalar `c` that makes the
+directionality exact:
 
-    c = (fn(b) - fn(a) - g . d) / |d|^2
+    c = (fn(b) - fn(a) - g . d) / (d . W d)
 
 The bracket is a difference of nearly equal numbers: it carries an error of round-off
 size however small `d` is, and the division would amplify it. Below that size it holds
@@ -32,8 +33,10 @@ def _corrected(
     a: Coordinates,
     b: Coordinates,
     mean: Coordinates,
+    weights: Coordinates | float,
 ) -> Coordinates:
     d = b - a
+    along = weights * d
     fn_a, fn_b = fn(a), fn(b)
     defect = fn_b - fn_a - mean @ d
     size = abs(fn_a) + abs(fn_b) + abs(mean) @ (abs(a) + abs(b))
@@ -41,8 +44,8 @@ def _corrected(
     holds_digits = ~(abs(defect) <= jnp.finfo(a.dtype).eps * size)
     # Both operands of the quotient are guarded: under autodiff the branch that `where`
     # does not take is multiplied by zero, and must be finite for that.
-    length2 = jnp.where(holds_digits, d @ d, 1.0)
-    return mean + jnp.where(holds_digits, defect, 0.0) / length2 * d
+    length2 = jnp.where(holds_digits, d @ along, 1.0)
+    return mean + jnp.where(holds_digits, defect, 0.0) / length2 * along
 
 
 class Gonzalez(AbstractDerivative):
@@ -56,9 +59,14 @@ class Gonzalez(AbstractDerivative):
     """
 
     def gradient(
-        self, fn: Callable[[Coordinates], Scalar], a: Coordinates, b: Coordinates
+        self,
+        fn: Callable[[Coordinates], Scalar],
+        a: Coordinates,
+        b: Coordinates,
+        *,
+        weights: Coordinates | float = 1.0,
     ) -> Coordinates:
-        return _corrected(fn, a, b, jax.grad(fn)(0.5 * (a + b)))
+        return _corrected(fn, a, b, jax.grad(fn)(0.5 * (a + b)), weights)
 
 
 class MeanValue(AbstractDerivative):
@@ -85,13 +93,18 @@ class MeanValue(AbstractDerivative):
             raise ValueError(f"`MeanValue(points={self.points})`: use 1 point or more.")
 
     def gradient(
-        self, fn: Callable[[Coordinates], Scalar], a: Coordinates, b: Coordinates
+        self,
+        fn: Callable[[Coordinates], Scalar],
+        a: Coordinates,
+        b: Coordinates,
+        *,
+        weights: Coordinates | float = 1.0,
     ) -> Coordinates:
-        nodes, weights = np.polynomial.legendre.leggauss(self.points)
+        nodes, shares = np.polynomial.legendre.leggauss(self.points)
         mid, half = 0.5 * (a + b), 0.5 * (b - a)
         # Unrolled: a batched gradient hides the structure of `fn` from XLA.
         mean = sum(
             jnp.asarray(w / 2, a.dtype) * jax.grad(fn)(mid + jnp.asarray(x, a.dtype) * half)
-            for x, w in zip(nodes, weights, strict=True)
+            for x, w in zip(nodes, shares, strict=True)
         )
-        return _corrected(fn, a, b, jnp.asarray(mean))
+        return _corrected(fn, a, b, jnp.asarray(mean), weights)

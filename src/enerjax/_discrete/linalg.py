@@ -14,10 +14,10 @@ from jax.extend.core import jaxpr_as_fun
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
+from .arithmetic import both
 from .transform import (
     at_a,
     at_b,
-    evaluate,
     increment,
     moves,
     Moving,
@@ -25,13 +25,6 @@ from .transform import (
     Switching,
     Value,
 )
-
-
-def _ends(values: list[Value], params: dict[str, Any]) -> tuple[list[Array], list[Array]]:
-    params = {k: v for k, v in params.items() if k != "walk"}
-    primitive = params.pop("primitive")
-    a = evaluate(primitive, list(map(at_a, values)), params)
-    return a, evaluate(primitive, list(map(at_b, values)), params)
 
 
 def _transposed(x: Array) -> Array:
@@ -48,7 +41,7 @@ def _lower(factor: Array, right: Array, unit: bool = False) -> Array:
 def cholesky(values: list[Value], params: dict[str, Any]) -> list[Value]:
     """`dA = dL Lm^T + Lm dL^T`, so `Lm^-1 dA Lm^-T` is `Lm^-1 dL` plus its transpose."""
     (matrix,) = values
-    (a,), (b,) = _ends(values, params)
+    ((a, b),) = both(values, params)
     # The primitive leaves the upper triangle undefined.
     mean = jnp.tril(0.5 * (a + b))
     symmetric = 0.5 * (matrix.d + _transposed(matrix.d))
@@ -60,7 +53,7 @@ def cholesky(values: list[Value], params: dict[str, Any]) -> list[Value]:
 def triangular_solve(values: list[Value], params: dict[str, Any]) -> list[Value]:
     if params["conjugate_a"]:
         raise NoRule
-    (a,), (b,) = _ends(values, params)
+    ((a, b),) = both(values, params)
     matrix, right = values
     lower, unit = params["lower"], params["unit_diagonal"]
     # The entries that the solve reads: without the diagonal where that counts as one.
@@ -85,16 +78,16 @@ def linear_solve(values: list[Value], params: dict[str, Any]) -> list[Value]:
     right = values[sum(lengths) :]
     if any(isinstance(v, Switching) for v in (*consts, *right)):
         raise NoRule
-    ends = _ends(values, params)
+    ends = both(values, params)
     walk = params["walk"]
-    means = [0.5 * (a + b) for a, b in zip(*ends, strict=True)]
+    means = [0.5 * (a + b) for a, b in ends]
     changes = [increment(v) for v in right]
     if any(moves(c) for c in consts):
         moved = walk.closed(program, [*consts, *means])
         changes = [db - increment(m) for db, m in zip(changes, moved, strict=True)]
     middle = [0.5 * (at_a(c) + at_b(c)) if moves(c) else c for c in consts]
     out = _solve(program, middle, changes)
-    return [Moving(a, b, d) for a, b, d in zip(*ends, out, strict=True)]
+    return [Moving(a, b, d) for (a, b), d in zip(ends, out, strict=True)]
 
 
 def _solve(program: Any, consts: list[Array], right: list[Array]) -> list[Array]:
@@ -135,7 +128,7 @@ def lu(values: list[Value], params: dict[str, Any]) -> list[Value]:
     that were asked for: the true difference is shared out over the matrix.
     """
     (matrix,) = values
-    (fa, pa, ra), (fb, pb, rb) = _ends(values, params)
+    (fa, fb), (pa, pb), (ra, rb) = both(values, params)
     if matrix.a.ndim != 2 or matrix.a.shape[0] != matrix.a.shape[1]:
         raise NoRule
     mean = 0.5 * (fa + fb)

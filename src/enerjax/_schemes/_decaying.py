@@ -4,10 +4,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .._segment import Increment
+from .._model import Drive, Increment, SeparableModel
 from .._system import State
 from .._tracing import is_known
-from .._types import Coordinates, Multipliers, Real, Scalar, Velocities
+from .._types import Multipliers, Real, Scalar, Velocities
 from .base import StepProblem
 
 
@@ -59,8 +59,10 @@ def predict_jump_and_end(
     the equation for kappa is singular.
     """
     end = problem.guess(acceleration, multipliers)
-    rate = problem.model.lift(problem.start.q, -problem.h / 6 * acceleration)
-    return JumpAndEnd(Increment(rate, end.impulse, end.velocity_impulse), end)
+    start, lift = problem.start, lambda v: problem.model.lift(problem.start.q, v)
+    _, rate = jax.jvp(lift, (start.v,), (-problem.h / 6 * acceleration,))
+    momentum = start.v[: end.momentum.size]
+    return JumpAndEnd(Increment(rate, momentum, end.impulse, end.velocity_impulse), end)
 
 
 def split_velocities(
@@ -72,31 +74,28 @@ def split_velocities(
     return vj, total - vj
 
 
-def momentum_rows(
-    problem: StepProblem,
-    alpha: Scalar,
-    jump: State,
-    end: State,
-    z: JumpAndEnd,
-    impulse_after: Coordinates,
-    impulse_before: Coordinates,
-) -> tuple[Coordinates, Coordinates]:
-    """Balance of momentum from `z0` to `zj` and from `z0` to `z1`, eq. (47b, a)."""
-    model, h = problem.model, problem.h
-    q0, v0 = problem.start.q, problem.start.v
-    curvature = model.potential_gradient(jump.q) - model.potential_gradient(q0)
-    to_jump = problem.segment(q0, jump.q).momentum(v0, jump.v, h * z.jump.rate)
-    to_end = problem.segment(q0, end.q).momentum(v0, end.v, h * z.end.rate)
-    return (
-        to_jump
-        - (impulse_after - impulse_before) / 3
-        + alpha.astype(h.dtype) * h / 6 * curvature,
-        to_end + impulse_after,
+def jump_drive(
+    alpha: Scalar, after: Drive, before: Drive, start: Drive, jump: Drive
+) -> Drive:
+    """What drives `z0 -> zj`: `-(DH_g - DH_h)/3 + alpha/6 (grad H(zj) - grad H(z0))`.
+
+    eq. (47b); `start` and `jump` are the gradients there.
+    """
+    return jax.tree.map(
+        lambda g, h, x0, xj: -(g - h) / 3 + alpha.astype(g.dtype) / 6 * (xj - x0),
+        after,
+        before,
+        start,
+        jump,
     )
 
 
 def jump_energy(problem: StepProblem, jump: State) -> tuple[Scalar, Scalar]:
     """`K_jump` and `V_jump`, eq. (34) and (36)."""
-    model, start = problem.model, problem.start
-    gradients = model.potential_gradient(jump.q) - model.potential_gradient(start.q)
-    return model.kinetic(jump.v - start.v), 0.5 * (jump.q - start.q) @ gradients
+    model, start, h = problem.model, problem.start, problem.h
+    before, after = model.gradient(start, h), model.gradient(jump, h)
+    potential = 0.5 * (jump.q - start.q) @ (after.impulse - before.impulse) / h
+    dv = jump.v - start.v
+    if isinstance(model, SeparableModel):
+        return model.kinetic_of(dv), potential
+    return 0.5 * dv @ (after.drift - before.drift), potential

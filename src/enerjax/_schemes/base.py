@@ -2,13 +2,13 @@ import abc
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from .._discrete import AbstractDerivative
-from .._model import Model
+from .._model import AbstractModel, Drive, Increment
 from .._results import RESULTS
-from .._segment import Increment, Segment
 from .._system import State
 from .._types import (
     Coordinates,
@@ -29,18 +29,23 @@ P = TypeVar("P")
 class StepProblem(eqx.Module):
     """Everything that is known when a step starts."""
 
-    model: Model
+    model: AbstractModel
     start: State
     h: Scalar
     derivative: AbstractDerivative
     formulation: Formulation = eqx.field(static=True)
 
-    def segment(self, qa: Coordinates, qb: Coordinates) -> Segment:
-        return Segment(self.model, self.derivative, qa, qb)
-
     def at(self, increment: Increment) -> Coordinates:
         """The configuration that an increment leads to."""
         return self.start.q + self.h * increment.rate
+
+    def node(self, increment: Increment) -> State:
+        """The state that an increment leads to, where momenta are unknowns."""
+        return State(self.at(increment), increment.momentum)
+
+    def drive(self, a: State, b: State, increment: Increment) -> Drive:
+        """The discrete gradient over `a -> b`."""
+        return self.model.drive(self.derivative, a, b, self.h, increment)
 
     def joint_rate(self, q: Coordinates, v: Velocities) -> JointMultipliers:
         """`psi(q, v)` where the formulation holds it, else no rows."""
@@ -48,20 +53,27 @@ class StepProblem(eqx.Module):
             return jnp.zeros((0,), q.dtype)
         return self.model.joint_rate(q, v)
 
-    def rows(self, momentum: Coordinates, end: State) -> Increment:
-        """The rows of one node: balance of momentum, and the constraints held there."""
+    def rows(self, z: Increment, node: State, drive: Drive) -> Increment:
+        """The rows of one node: the structure residual, and the constraints held there."""
+        structure = self.model.structure(self.start, node, self.h, z.rate, drive)
         return Increment(
-            momentum,
-            self.model.constraint(end.q) / self.h,
-            self.joint_rate(end.q, end.v),
+            structure.impulse,
+            structure.drift,
+            self.model.constraint(node.q) / self.h,
+            self.joint_rate(node.q, node.v),
         )
 
     def guess(self, acceleration: Velocities, multipliers: Multipliers) -> Increment:
         """The increment of a Taylor step of the whole length."""
-        q, v = self.start.q, self.start.v
-        rate = self.model.lift(q, v + 0.5 * self.h * acceleration)
-        num_rates = self.joint_rate(q, v).size
-        return Increment(rate, self.h * multipliers, jnp.zeros((num_rates,), q.dtype))
+        q, v, h = self.start.q, self.start.v, self.h
+        momentum = v + h * acceleration
+        num_rates = jax.eval_shape(self.joint_rate, q, v).size
+        return Increment(
+            self.model.lift(q, v + 0.5 * h * acceleration),
+            momentum if self.model.has_own_momenta else momentum[:0],
+            h * multipliers,
+            jnp.zeros((num_rates,), q.dtype),
+        )
 
 
 class StepEnd(eqx.Module):
@@ -127,7 +139,7 @@ class AbstractSingleSolve(AbstractScheme, Generic[Z, P]):
         """Whether a step of `-h` undoes a step of `h`: such a scheme can be composed."""
 
     @abc.abstractmethod
-    def problem(self, model: Model, start: State, h: Scalar) -> P:
+    def problem(self, model: AbstractModel, start: State, h: Scalar) -> P:
         """The data of a step: a `StepProblem`, or one with more that stays fixed."""
 
     @abc.abstractmethod

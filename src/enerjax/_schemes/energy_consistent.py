@@ -5,9 +5,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._discrete import AbstractDerivative, MeanValue
-from .._model import Model
+from .._model import AbstractModel, CanonicalModel, Drive, Increment, SeparableModel
 from .._results import RESULTS
-from .._segment import Increment
 from .._system import State
 from .._tracing import is_known
 from .._types import Coordinates, Multipliers, Real, Scalar, Velocities
@@ -20,10 +19,15 @@ class _Frozen(eqx.Module):
     """A step's data, with the dissipative stiffness fixed before the solve."""
 
     step: StepProblem
-    # P: positive semidefinite part of the stiffness near the start.
+    # P = diag(K+, M^-1): the positive semidefinite part of the stiffness near the start,
+    # and the inertia there.
     stiffness: Float[Array, "nq nq"]
-    # X: (M + (alpha h/6)^2 P)^-1 (h/6) P, so that j_v = X (dq + alpha h/6 dv).
+    inertia: Float[Array, "nq nq"]
+    compliance: Float[Array, "nq nq"]
+    # X = (M + lag^2 K+)^-1 (h/6) K+ with lag = alpha h/6: j_v = X (dq + lag dv).
     jump: Float[Array, "nq nq"]
+    # (1 + lag X)^-1, where velocities are eliminated.
+    damping: Float[Array, "nq nq"]
 
 
 class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
@@ -49,7 +53,8 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
     - Constraints held at: position and velocity level.
     - Order: 4 at `alpha = 0` (then symmetric: `Composed` raises it to 6 or 8), else 3;
       2 where the `derivative` is `Gonzalez()` and `V` is not quadratic.
-    - Needs `v = qdot`: with `kinematics` use `EnergyPreserving` or `EnergyDecaying`.
+    - Needs canonical coordinates, `v = qdot` or momenta: with `kinematics` use
+      `EnergyPreserving` or `EnergyDecaying`.
 
     **Arguments:**
 
@@ -90,25 +95,31 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
     def order(self) -> int:
         return 4 if self.symmetric else 3
 
-    def problem(self, model: Model, start: State, h: Scalar) -> _Frozen:
-        if not model.has_identity_kinematics:
+    def problem(self, model: AbstractModel, start: State, h: Scalar) -> _Frozen:
+        if not model.has_canonical_rates:
             raise ValueError(
                 "`EnergyConsistent` needs velocities that are the rates of the "
                 "coordinates, and this system has `kinematics`. Use `EnergyPreserving` "
                 "or `EnergyDecaying`, or describe rotations without `kinematics` "
-                "(directors)."
+                "(directors, or `System.from_hamiltonian`)."
             )
         step = StepProblem(model, start, h, self.derivative, "ggl")
         # P only has to be semidefinite and near the stiffness for the law and the order,
         # so the multipliers of the start serve. Inside the solve it would cost an
         # eigenvalue problem per iteration.
         _, multipliers = model.accelerations(start)
-        middle = start.q + 0.5 * h * start.v
-        stiffness = jax.hessian(lambda q: _strain(model, q, multipliers))(middle)
-        stiffness = semidefinite_part(stiffness, model.inertia)
-        lag = self.alpha.astype(h.dtype) * h / 6
-        jump = jnp.linalg.solve(model.inertia + lag**2 * stiffness, h / 6 * stiffness)
-        return _Frozen(step, stiffness, jump)
+        middle = State(start.q + 0.5 * h * model.lift(start.q, start.v), start.v)
+        stiffness, inertia = model.stiffness(middle, multipliers)
+        stiffness = semidefinite_part(stiffness, inertia)
+        lag = self._alpha(h) * h / 6
+        jump = jnp.linalg.solve(inertia + lag**2 * stiffness, h / 6 * stiffness)
+        if isinstance(model, SeparableModel):
+            compliance = model.inverse_inertia
+            damping = jnp.linalg.inv(jnp.eye(start.q.size, dtype=h.dtype) + lag * jump)
+        else:
+            compliance = jnp.linalg.inv(inertia)
+            damping = jnp.zeros((0, 0), h.dtype)
+        return _Frozen(step, stiffness, inertia, compliance, jump, damping)
 
     def predict(
         self, problem: _Frozen, acceleration: Velocities, multipliers: Multipliers
@@ -116,53 +127,77 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
         return problem.step.guess(acceleration, multipliers)
 
     def residual(self, z: Increment, problem: _Frozen) -> Increment:
-        step, model, h = problem.step, problem.step.model, problem.step.h
-        q0, v0 = step.start.q, step.start.v
-        end, jump_v = self._end(z, problem)
-        segment = step.segment(q0, end.q)
-        dv = end.v - v0
-        jump = segment.impulse(h, z, 0.5 * (v0 + end.v)) - h / 12 * self._stiffness(
-            z, problem, dv
-        )
-        dissipation = h**2 / 12 * self._alpha(h) * problem.stiffness @ jump_v
-        return step.rows(model.inertia @ dv + jump + dissipation, end)
-
-    def finish(self, z: Increment, problem: _Frozen) -> StepEnd:
         step, h = problem.step, problem.step.h
         end, jump_v = self._end(z, problem)
-        alpha = self._alpha(h)
-        jump_q = -h / 6 * (end.v - step.start.v - alpha * jump_v)
-        size = jump_q @ problem.stiffness @ jump_q + 2 * step.model.kinetic(jump_v)
+        drive = step.drive(step.start, end, z)
+        twist = self._twist(z, problem, end.v - step.start.v)
+        dissipation = h**2 / 12 * self._alpha(h) * problem.stiffness @ jump_v
+        impulse = drive.impulse - h / 12 * twist.impulse + dissipation
+        drift = drive.drift
+        if step.model.has_own_momenta:
+            undamped = h / 6 * problem.compliance @ (problem.stiffness @ (h * z.rate))
+            drift = drift - h / 12 * twist.drift + 0.5 * (jump_v - undamped)
+        return step.rows(z, end, Drive(impulse, drift))
+
+    def finish(self, z: Increment, problem: _Frozen) -> StepEnd:
+        step, h, alpha = problem.step, problem.step.h, self._alpha(problem.step.h)
+        end, jump_v = self._end(z, problem)
+        dv = self._velocity(problem, end.v - step.start.v)
+        jump_q = -h / 6 * (dv - alpha * jump_v)
+        size = jump_q @ problem.stiffness @ jump_q + jump_v @ problem.inertia @ jump_v
         return StepEnd(end, z.impulse / h, 0.5 * alpha * size, None, RESULTS.successful)
 
     def _alpha(self, h: Scalar) -> Scalar:
         return self.alpha.astype(h.dtype)
 
-    def _stiffness(self, z: Increment, problem: _Frozen, x: Coordinates) -> Coordinates:
-        """`h K x` with the stiffness at the midpoint."""
-        step = problem.step
-        middle = step.start.q + 0.5 * step.h * z.rate
-        forces = jax.grad(lambda q: step.h * _strain(step.model, q, z.impulse / step.h))
-        return jax.jvp(forces, (middle,), (x,))[1]
+    def _velocity(self, problem: _Frozen, dv: Velocities) -> Velocities:
+        """A change of velocity, from what the states hold."""
+        return problem.compliance @ dv if problem.step.model.has_own_momenta else dv
+
+    def _twist(self, z: Increment, problem: _Frozen, dv: Velocities) -> Drive:
+        """`D J D (z1 - z0)`, `h` times in the first part, with `D` at the midpoint.
+
+        It is orthogonal to `z1 - z0`, so it does no work. Where velocities are eliminated
+        only the first part is needed: `h K dv`.
+        """
+        step, model, h = problem.step, problem.step.model, problem.step.h
+        middle = step.start.q + 0.5 * h * z.rate
+        if isinstance(model, SeparableModel):
+            return Drive(self._stiffness(z, model, h, middle, dv), dv[:0])
+        assert isinstance(model, CanonicalModel)
+        action = lambda q, p: h * model.hamiltonian(q, p) + z.impulse @ model.constraint(q)
+        forces = jax.grad(action, argnums=(0, 1))
+        at = middle, step.start.v + 0.5 * dv
+        # h D: one factor h remains in the second product, and is divided out for `w_mu`.
+        _, (force, rate) = jax.jvp(forces, at, (h * z.rate, dv))
+        _, (force, rate) = jax.jvp(forces, at, (rate / h, -force / h))
+        return Drive(force, rate / h)
+
+    def _stiffness(
+        self, z: Increment, model: SeparableModel, h: Scalar, q: Coordinates, x: Coordinates
+    ) -> Coordinates:
+        """`h K x` at `q`."""
+        action = lambda q: h * model.strain(q, z.impulse / h)
+        return jax.jvp(jax.grad(action), (q,), (x,))[1]
 
     def _end(self, z: Increment, problem: _Frozen) -> tuple[State, Velocities]:
         """The end of the step, and `j_v` of the dissipative jump."""
         step, model, h = problem.step, problem.step.model, problem.step.h
-        q1, dq, lag = step.at(z), h * z.rate, self._alpha(h) * h / 6
-        reaction = step.segment(step.start.q, q1).reaction(z.velocity_impulse)
-        inverse, jump = model.inverse_inertia, problem.jump
+        start, dq, lag = step.start, h * z.rate, self._alpha(h) * h / 6
+        if not isinstance(model, SeparableModel):
+            end = step.node(z)
+            dv = self._velocity(problem, end.v - start.v)
+            return end, problem.jump @ (dq + lag * dv)
+        q1 = step.at(z)
+        reaction = model.mean_reaction(start.q, q1, z.velocity_impulse)
+        curved = self._stiffness(z, model, h, start.q + 0.5 * dq, dq)
         # The upper half of the step equations, solved for the change of velocity; what
         # the dissipative jump adds to them depends on that change itself.
-        undamped = h / 6 * inverse @ (problem.stiffness @ dq)
+        pushed = problem.jump @ dq
         right = (
-            2 * (z.rate - step.start.v - reaction)
-            - inverse @ self._stiffness(z, problem, dq) / 6
-            - (jump @ dq - undamped)
+            2 * (z.rate - start.v - reaction)
+            - model.inverse_inertia @ (curved - h * problem.stiffness @ dq) / 6
+            - pushed
         )
-        dv = jnp.linalg.solve(jnp.eye(dq.size, dtype=dq.dtype) + lag * jump, right)
-        return State(q1, step.start.v + dv), jump @ (dq + lag * dv)
-
-
-def _strain(model: Model, q: Coordinates, multipliers: Multipliers) -> Scalar:
-    """`V + lambda . Phi`, the energy whose Hessian is the stiffness."""
-    return model.potential(q) + multipliers @ model.constraint(q)
+        dv = problem.damping @ right
+        return State(q1, start.v + dv), pushed + lag * problem.jump @ dv

@@ -1,16 +1,16 @@
 import equinox as eqx
 
-from .._discrete import AbstractDerivative, Gonzalez
-from .._model import Model
+from .._discrete import AbstractDerivative, ChainRule
+from .._model import AbstractModel, SeparableModel
 from .._results import RESULTS
 from .._system import State
 from .._types import Multipliers, Real, Scalar, Velocities
 from ._decaying import (
     alpha_from_spectral_radius,
     as_alpha,
+    jump_drive,
     jump_energy,
     JumpAndEnd,
-    momentum_rows,
     predict_jump_and_end,
     split_velocities,
 )
@@ -35,8 +35,10 @@ class EnergyDecaying(AbstractSingleSolve[JumpAndEnd, StepProblem]):
     - Conserves: energy, to round-off, at `alpha = 0`.
     - Dissipates: `alpha (K_jump + V_jump)` with `K_jump = |vj - v0|_M^2 / 2` and
       `V_jump = (qj - q0) . (grad V(qj) - grad V(q0)) / 2`, which is never negative where
-      `V` is convex over the jump. On a linear oscillator of frequency `w` the step tends
-      to `rho_inf = (1 - alpha) / (1 + alpha)` as `h w` grows.
+      `V` is convex over the jump. (With a Hamiltonian their sum is
+      `(zj - z0) . (grad H(zj) - grad H(z0)) / 2`, and `H` must be convex.) On a linear
+      oscillator of frequency `w` the step tends to `rho_inf = (1 - alpha) / (1 + alpha)`
+      as `h w` grows.
     - Constraints held at: position level at `zj` and `z1`; with `formulation="ggl"`
       velocity level too.
     - Order: 2. Unconstrained with `v = qdot`, 3 with `MeanValue()` or one coordinate.
@@ -59,7 +61,7 @@ class EnergyDecaying(AbstractSingleSolve[JumpAndEnd, StepProblem]):
     formulation: Formulation = eqx.field(  # pyright: ignore[reportIncompatibleMethodOverride]
         default="ggl", static=True
     )
-    derivative: AbstractDerivative = Gonzalez()
+    derivative: AbstractDerivative = ChainRule()
 
     def __check_init__(self):
         check_formulation("EnergyDecaying", self.formulation)
@@ -69,7 +71,7 @@ class EnergyDecaying(AbstractSingleSolve[JumpAndEnd, StepProblem]):
         cls,
         rho_inf: Real,
         formulation: Formulation = "ggl",
-        derivative: AbstractDerivative = Gonzalez(),
+        derivative: AbstractDerivative = ChainRule(),
     ) -> "EnergyDecaying":
         """The scheme whose high-frequency limit is `rho_inf`, in [0, 1]."""
         alpha = alpha_from_spectral_radius(rho_inf)
@@ -83,7 +85,7 @@ class EnergyDecaying(AbstractSingleSolve[JumpAndEnd, StepProblem]):
     def symmetric(self) -> bool:
         return False
 
-    def problem(self, model: Model, start: State, h: Scalar) -> StepProblem:
+    def problem(self, model: AbstractModel, start: State, h: Scalar) -> StepProblem:
         return StepProblem(model, start, h, self.derivative, self.formulation)
 
     def predict(
@@ -92,21 +94,14 @@ class EnergyDecaying(AbstractSingleSolve[JumpAndEnd, StepProblem]):
         return predict_jump_and_end(problem, acceleration, multipliers)
 
     def residual(self, z: JumpAndEnd, problem: StepProblem) -> JumpAndEnd:
+        model, start, h = problem.model, problem.start, problem.h
         jump, end = self._nodes(z, problem)
-        h, v0 = problem.h, problem.start.v
-        after = problem.segment(jump.q, end.q)
-        before = problem.segment(problem.start.q, jump.q)
-        momentum_jump, momentum_end = momentum_rows(
-            problem,
-            self.alpha,
-            jump,
-            end,
-            z,
-            after.impulse(h, z.end, 0.5 * (jump.v + end.v)),
-            before.impulse(h, z.jump, 0.5 * (v0 + jump.v)),
-        )
+        after = problem.drive(jump, end, z.end)
+        before = problem.drive(start, jump, z.jump)
+        gradients = model.gradient(start, h), model.gradient(jump, h)
+        to_jump = jump_drive(self.alpha, after, before, *gradients)
         return JumpAndEnd(
-            problem.rows(momentum_jump, jump), problem.rows(momentum_end, end)
+            problem.rows(z.jump, jump, to_jump), problem.rows(z.end, end, after)
         )
 
     def finish(self, z: JumpAndEnd, problem: StepProblem) -> StepEnd:
@@ -121,15 +116,16 @@ class EnergyDecaying(AbstractSingleSolve[JumpAndEnd, StepProblem]):
         )
 
     def _nodes(self, z: JumpAndEnd, problem: StepProblem) -> tuple[State, State]:
+        model, q0, v0 = problem.model, problem.start.q, problem.start.v
+        if not isinstance(model, SeparableModel):
+            return problem.node(z.jump), problem.node(z.end)
         qj, q1 = problem.at(z.jump), problem.at(z.end)
-        after = problem.segment(qj, q1).reaction(z.end.velocity_impulse)
-        before = problem.segment(problem.start.q, qj).reaction(z.jump.velocity_impulse)
-        push_end = problem.segment(problem.start.q, q1).push(z.end.rate)
-        push_jump = problem.segment(problem.start.q, qj).push(z.jump.rate)
+        after = model.mean_reaction(qj, q1, z.end.velocity_impulse)
+        before = model.mean_reaction(q0, qj, z.jump.velocity_impulse)
         vj, v1 = split_velocities(
             self.alpha,
-            problem.start.v,
-            2 * (push_end - after),  # eq. (47d): vj + v1
-            -6 * push_jump - 2 * (after - before),  # eq. (47e)
+            v0,
+            2 * (model.push(q0, q1, z.end.rate) - after),  # eq. (47d): vj + v1
+            -6 * model.push(q0, qj, z.jump.rate) - 2 * (after - before),  # eq. (47e)
         )
         return State(qj, vj), State(q1, v1)

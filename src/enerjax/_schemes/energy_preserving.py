@@ -1,10 +1,9 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._discrete import AbstractDerivative, Gonzalez
-from .._model import Model
+from .._discrete import AbstractDerivative, ChainRule
+from .._model import AbstractModel, Increment, SeparableModel
 from .._results import RESULTS
-from .._segment import Increment
 from .._system import State
 from .._types import Multipliers, Scalar, Velocities
 from .base import (
@@ -39,7 +38,7 @@ class EnergyPreserving(AbstractSingleSolve[Increment, StepProblem]):
     formulation: Formulation = eqx.field(  # pyright: ignore[reportIncompatibleMethodOverride]
         default="ggl", static=True
     )
-    derivative: AbstractDerivative = Gonzalez()
+    derivative: AbstractDerivative = ChainRule()
 
     def __check_init__(self):
         check_formulation("EnergyPreserving", self.formulation)
@@ -52,7 +51,7 @@ class EnergyPreserving(AbstractSingleSolve[Increment, StepProblem]):
     def symmetric(self) -> bool:
         return True
 
-    def problem(self, model: Model, start: State, h: Scalar) -> StepProblem:
+    def problem(self, model: AbstractModel, start: State, h: Scalar) -> StepProblem:
         return StepProblem(model, start, h, self.derivative, self.formulation)
 
     def predict(
@@ -61,12 +60,9 @@ class EnergyPreserving(AbstractSingleSolve[Increment, StepProblem]):
         return problem.guess(acceleration, multipliers)
 
     def residual(self, z: Increment, problem: StepProblem) -> Increment:
-        v0, h = problem.start.v, problem.h
         end = self._end(z, problem)
-        step = problem.segment(problem.start.q, end.q)
-        momentum = step.momentum(v0, end.v, h * z.rate)  # eq. (14a)
-        momentum = momentum + step.impulse(h, z, 0.5 * (v0 + end.v))
-        return problem.rows(momentum, end)  # eq. (14c)
+        drive = problem.drive(problem.start, end, z)
+        return problem.rows(z, end, drive)  # eq. (14a, c)
 
     def finish(self, z: Increment, problem: StepProblem) -> StepEnd:
         return StepEnd(
@@ -78,8 +74,11 @@ class EnergyPreserving(AbstractSingleSolve[Increment, StepProblem]):
         )
 
     def _end(self, z: Increment, problem: StepProblem) -> State:
+        model, start = problem.model, problem.start
+        if not isinstance(model, SeparableModel):
+            return problem.node(z)
         q1 = problem.at(z)
-        step = problem.segment(problem.start.q, q1)
         # eq. (14b), solved for the velocity
-        mean = step.push(z.rate) - step.reaction(z.velocity_impulse)
-        return State(q1, 2 * mean - problem.start.v)
+        mean = model.push(start.q, q1, z.rate)
+        mean = mean - model.mean_reaction(start.q, q1, z.velocity_impulse)
+        return State(q1, 2 * mean - start.v)

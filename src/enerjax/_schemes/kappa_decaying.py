@@ -1,18 +1,18 @@
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._discrete import AbstractDerivative, Gonzalez
-from .._model import Model
+from .._discrete import AbstractDerivative, ChainRule
+from .._model import AbstractModel, Drive, Increment, SeparableModel
 from .._results import RESULTS
-from .._segment import Increment, reaction
 from .._system import State
 from .._types import JointMultipliers, Multipliers, Scalar, Velocities
 from ._decaying import (
     as_alpha,
+    jump_drive,
     jump_energy,
     JumpAndEnd,
-    momentum_rows,
     predict_jump_and_end,
     split_velocities,
 )
@@ -55,7 +55,7 @@ class KappaDecaying(AbstractSingleSolve[_Unknowns, StepProblem]):
     """
 
     alpha: Scalar = eqx.field(converter=as_alpha)
-    derivative: AbstractDerivative = Gonzalez()
+    derivative: AbstractDerivative = ChainRule()
 
     @property
     def order(self) -> int:
@@ -69,7 +69,7 @@ class KappaDecaying(AbstractSingleSolve[_Unknowns, StepProblem]):
     def symmetric(self) -> bool:
         return False
 
-    def problem(self, model: Model, start: State, h: Scalar) -> StepProblem:
+    def problem(self, model: AbstractModel, start: State, h: Scalar) -> StepProblem:
         return StepProblem(model, start, h, self.derivative, "ggl")
 
     def predict(
@@ -80,23 +80,25 @@ class KappaDecaying(AbstractSingleSolve[_Unknowns, StepProblem]):
         return _Unknowns(nodes, jnp.ones((num_kappa,), problem.h.dtype))
 
     def residual(self, z: _Unknowns, problem: StepProblem) -> _Unknowns:
-        h, v0 = problem.h, problem.start.v
+        model, start, h = problem.model, problem.start, problem.h
         jump, end = self._nodes(z, problem)
-        after = problem.segment(jump.q, end.q)
-        before = problem.segment(problem.start.q, jump.q)
-        momentum_jump, momentum_end = momentum_rows(  # eq. (66b, a)
-            problem,
-            self.alpha,
-            jump,
-            end,
-            z.nodes,
-            after.impulse(h, _position_level(z.nodes.end), v0),
-            before.impulse(h, _position_level(z.nodes.jump), v0),
-        )
+        nodes, kappa = z.nodes, _kappa(z)
+        after = problem.drive(jump, end, _position_level(nodes.end))
+        before = problem.drive(start, jump, _position_level(nodes.jump))
+        work = self._kappa_row(z, problem, jump, end, after, before)
+        gradients = [model.gradient(state, h) for state in (start, jump)]
+        scaled = [_scaled(kappa, x) for x in (after, before, *gradients)]
+        if model.has_own_momenta:
+            at_jump = model.reaction(jump, _eta(nodes.jump))
+            at_end = model.reaction(end, _eta(nodes.end))
+            scaled[0] = _pushed(scaled[0], 0.5 * (at_jump + at_end))
+            scaled[1] = _pushed(scaled[1], at_jump)
+        to_jump = jump_drive(self.alpha, *scaled)  # eq. (66b)
         rows = JumpAndEnd(
-            problem.rows(momentum_jump, jump), problem.rows(momentum_end, end)
+            problem.rows(nodes.jump, jump, to_jump),
+            problem.rows(nodes.end, end, scaled[0]),  # eq. (66a)
         )
-        return _Unknowns(rows, self._kappa_row(z, problem, jump, end))
+        return _Unknowns(rows, work)
 
     def finish(self, z: _Unknowns, problem: StepProblem) -> StepEnd:
         jump, end = self._nodes(z, problem)
@@ -113,31 +115,46 @@ class KappaDecaying(AbstractSingleSolve[_Unknowns, StepProblem]):
         )
 
     def _kappa_row(
-        self, z: _Unknowns, problem: StepProblem, jump: State, end: State
+        self,
+        z: _Unknowns,
+        problem: StepProblem,
+        jump: State,
+        end: State,
+        after: Drive,
+        before: Drive,
     ) -> Float[Array, " nk"]:
         """eq. (70, 71), multiplied out, over an energy of the step."""
         if z.kappa.size == 0:
             return z.kappa
         model, v0 = problem.model, problem.start.v
-        change = model.kinetic(end.v) - model.kinetic(v0)
-        at_jump = model.joint_rate(jump.q, end.v + jump.v - 2 * v0)
-        at_end = model.joint_rate(end.q, end.v - jump.v)
+        if isinstance(model, SeparableModel):
+            change = model.kinetic_of(end.v) - model.kinetic_of(v0)
+        else:
+            change = after.drift @ (end.v - jump.v) + before.drift @ (jump.v - v0)
+        rate = lambda state, dv: jax.jvp(
+            lambda v: model.joint_rate(state.q, v), (state.v,), (dv,)
+        )[1]
+        at_jump = rate(jump, end.v + jump.v - 2 * v0)
+        at_end = rate(end, end.v - jump.v)
         work = _eta(z.nodes.jump) @ at_jump + _eta(z.nodes.end) @ at_end
         scale = model.energy_scale(problem.start, problem.h)
         return ((z.kappa - 1) * change + 0.5 * work) / scale
 
     def _nodes(self, z: _Unknowns, problem: StepProblem) -> tuple[State, State]:
-        q0, kappa = problem.start.q, _kappa(z)
-        qj, q1 = problem.at(z.nodes.jump), problem.at(z.nodes.end)
-        at_jump = reaction(problem.model, qj, _eta(z.nodes.jump))
-        at_end = reaction(problem.model, q1, _eta(z.nodes.end))
-        push_end = problem.segment(q0, q1).push(z.nodes.end.rate)
-        push_jump = problem.segment(q0, qj).push(z.nodes.jump.rate)
+        model, q0, kappa = problem.model, problem.start.q, _kappa(z)
+        jump, end = z.nodes.jump, z.nodes.end
+        if not isinstance(model, SeparableModel):
+            return problem.node(jump), problem.node(end)
+        qj, q1 = problem.at(jump), problem.at(end)
+        at_jump = model.reaction_at(qj, _eta(jump))
+        at_end = model.reaction_at(q1, _eta(end))
         vj, v1 = split_velocities(
             self.alpha,
             problem.start.v,
-            (2 * push_end - (at_jump + at_end)) / kappa,  # eq. (66c): vj + v1
-            -(6 * push_jump + (at_end - at_jump)) / kappa,  # eq. (66d)
+            # eq. (66c): vj + v1
+            (2 * model.push(q0, q1, end.rate) - (at_jump + at_end)) / kappa,
+            # eq. (66d)
+            -(6 * model.push(q0, qj, jump.rate) + (at_end - at_jump)) / kappa,
         )
         return State(qj, vj), State(q1, v1)
 
@@ -152,4 +169,14 @@ def _eta(increment: Increment) -> JointMultipliers:
 
 def _position_level(increment: Increment) -> Increment:
     """Without the velocity-level multipliers: in this scheme they drive no momentum."""
-    return Increment(increment.rate, increment.impulse, _eta(increment)[:0])
+    return Increment(
+        increment.rate, increment.momentum, increment.impulse, _eta(increment)[:0]
+    )
+
+
+def _scaled(kappa: Scalar, drive: Drive) -> Drive:
+    return Drive(drive.impulse, kappa * drive.drift)
+
+
+def _pushed(drive: Drive, velocity: Velocities) -> Drive:
+    return Drive(drive.impulse, drive.drift + velocity)

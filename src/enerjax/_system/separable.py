@@ -1,49 +1,20 @@
-r"""What the user declares, and the conventions of the whole package.
-
-Equations of motion (paper eq. 12), for coordinates `q` (nq), velocities `v = L(q) qdot`
-(nv), constant inertia `M`, potential `V(q)` and holonomic constraints `Phi(q) = 0`:
-
-    L^T M vdot + G(M v) qdot + dV/dq + B^T lambda = 0,   B = dPhi/dq
-    v = L qdot,   Phi(q) = 0
-
-so the force of a constraint on the coordinates is `-B^T lambda`, and a potential acts
-with `-dV/dq`. Units are the user's own, as long as they are consistent: a multiplier has
-the dimension of an energy per unit of its constraint.
-"""
-
 from collections.abc import Callable
-from typing import Any
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ._kinematics import (
+from .._kinematics import (
     AbstractKinematics,
     ConfigurationKinematics,
     IdentityKinematics,
 )
-from ._types import Args, Coordinates, Multipliers, Scalar, Velocities
+from .._types import Args, Coordinates, Multipliers, Scalar, Velocities
+from .base import AbstractSystem, check_function, inexact, State
+from .canonical import HamiltonianSystem, LagrangianSystem
 
 
-def _inexact(x: Any) -> Array:
-    x = jnp.asarray(x)
-    return x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(float)
-
-
-class State(eqx.Module):
-    """Coordinates and velocities at one instant (in a `Solution`: at each saved time).
-
-    - `q`: coordinates, shape `(nq,)`, in the units of the user's own coordinates.
-    - `v`: velocities `L(q) qdot`, shape `(nv,)`; `qdot` itself where no `kinematics` is
-      given.
-    """
-
-    q: Float[Array, "... nq"] = eqx.field(converter=_inexact)
-    v: Float[Array, "... nv"] = eqx.field(converter=_inexact)
-
-
-class System(eqx.Module):
+class System(AbstractSystem):
     """A conservative mechanical system with holonomic constraints.
 
     **Arguments:**
@@ -83,17 +54,13 @@ class System(eqx.Module):
         kinematics: Callable[[Coordinates, Args], Float[Array, "nv nq"]] | None = None,
         coordinate_constraint: Callable[[Coordinates, Args], Multipliers] | None = None,
     ):
+        check_function("potential", "(q, args)", potential)
         for name, value in [
-            ("potential", potential),
             ("constraint", constraint),
             ("kinematics", kinematics),
             ("coordinate_constraint", coordinate_constraint),
         ]:
-            if not (callable(value) or (value is None and name != "potential")):
-                raise TypeError(
-                    f"`System({name}=...)` must be a function of (q, args), got "
-                    f"{type(value).__name__}."
-                )
+            check_function(name, "(q, args)", value, optional=True)
         if coordinate_constraint is not None and kinematics is None:
             raise ValueError(
                 "`System(coordinate_constraint=...)` without `kinematics`: where the "
@@ -101,7 +68,7 @@ class System(eqx.Module):
                 "coordinates is an ordinary constraint. Pass it in `constraint`, or "
                 "give `kinematics`."
             )
-        self.kinetic = kinetic if callable(kinetic) else _inexact(kinetic)
+        self.kinetic = kinetic if callable(kinetic) else inexact(kinetic)
         self.potential = potential
         self.constraint = constraint
         self.coordinate_constraint = coordinate_constraint
@@ -121,6 +88,60 @@ class System(eqx.Module):
         """`V(q)` of one state (energy)."""
         return self.potential(state.q, args)
 
-    def energy(self, state: State, args: Args = None) -> Scalar:
-        """Total energy `1/2 v . M v + V(q)` of one state."""
-        return self.kinetic_energy(state, args) + self.potential_energy(state, args)
+    def inertia(self, state: State, args: Args) -> Float[Array, "nv nv"]:
+        """`M`, constant."""
+        if not callable(self.kinetic):
+            return self.kinetic.astype(state.v.dtype)
+        energy = lambda v: self.kinetic_energy(State(state.q, v), args)
+        return jax.hessian(energy)(jnp.zeros_like(state.v))
+
+    @staticmethod
+    def from_lagrangian(
+        kinetic: Callable[[Coordinates, Velocities, Args], Scalar],
+        potential: Callable[[Coordinates, Args], Scalar],
+        constraint: Callable[[Coordinates, Args], Multipliers] | None = None,
+    ) -> LagrangianSystem:
+        """A system whose inertia depends on its coordinates.
+
+        For minimal coordinates (angles of an arm), which need no constraint at all, and
+        wherever velocities are the rates of the coordinates but `System` asks for a
+        constant inertia. Everything runs as with a `System`: schemes, derivatives, audit.
+        The schemes work with the momenta `p = dT/dqdot`, unknowns of their own here, and
+        the energy `1/2 p . A(q)^-1 p + V(q)`, `A` the Hessian of `kinetic`. Where the
+        inertia is constant a `System` does the same work with half the unknowns.
+
+        **Arguments:**
+
+        - `kinetic`: `kinetic(q, qdot, args)`, a scalar (energy), quadratic in `qdot`.
+        - `potential`: `potential(q, args)`, a scalar (energy).
+        - `constraint`: `constraint(q, args)`, a vector that vanishes in every admissible
+          configuration. Leave it out if there is none.
+
+        **Returns:** what all functions take for a `System`; the `v` of a `State` is
+        `qdot`, shape `(nq,)`.
+        """
+        return LagrangianSystem(kinetic=kinetic, potential=potential, constraint=constraint)
+
+    @staticmethod
+    def from_hamiltonian(
+        hamiltonian: Callable[[Coordinates, Coordinates, Args], Scalar],
+        constraint: Callable[[Coordinates, Args], Multipliers] | None = None,
+    ) -> HamiltonianSystem:
+        """A system given by its Hamiltonian.
+
+        For canonical coordinates (a unit quaternion and its momentum), and for energies
+        that are no quadratic form of a velocity: magnetic forces, rotating frames,
+        relativistic particles.
+
+        **Arguments:**
+
+        - `hamiltonian`: `hamiltonian(q, p, args)`, a scalar (energy), strictly convex in
+          `p`: give redundant momenta an energy too, such as `(q . p)^2 / 2` of a
+          quaternion.
+        - `constraint`: as for `from_lagrangian`. It is held in `q`, and
+          `B(q) dH/dp = 0` in `p`.
+
+        **Returns:** what all functions take for a `System`; the `v` of a `State` is the
+        momentum `p`, shape `(nq,)`. The audit counts `H(q, 0)` as potential energy.
+        """
+        return HamiltonianSystem(hamiltonian=hamiltonian, constraint=constraint)

@@ -1,0 +1,102 @@
+"""Bad input, told before any step: what is wrong, why that is likely, what to do.
+
+Shapes and types are checked always, values where they are known: outside of `jit`, `vmap`
+and `grad`.
+"""
+
+import functools
+import operator
+import warnings
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._schemes import AbstractScheme
+from .._system import AbstractSystem, State
+from .._tracing import is_known
+from .._types import Args, Real, Scalar
+from .shapes import check_shapes
+from .values import check_values
+
+
+def prepare(
+    system: AbstractSystem, scheme: AbstractScheme, start: State, args: Args, h: Real
+) -> tuple[State, Args, Scalar]:
+    """Checked start, `args` of arrays, and `h` in the dtype of the start."""
+    if not isinstance(scheme, AbstractScheme):
+        raise TypeError(
+            f"`scheme` must be a scheme such as `EnergyPreserving()`, got {scheme!r}"
+            + (": the parentheses are missing." if isinstance(scheme, type) else ".")
+        )
+    start, args = check_system(system, start, args)
+    if any(jnp.ndim(x) > 0 for x in jax.tree.leaves(scheme)):
+        raise ValueError(
+            f"The numbers of the scheme must be scalars, got {scheme}. To sweep them put "
+            "the scheme inside `jax.vmap`."
+        )
+    if is_known(h) and np.ndim(h) == 0 and not 0 < float(np.real(h)) < np.inf:
+        raise ValueError(f"`h` must be positive and finite, got {h}.")
+    h = jnp.asarray(h, start.q.dtype)
+    if h.ndim != 0:
+        raise ValueError(
+            f"`h` must be a scalar, got shape {h.shape}. To sweep it use `jax.vmap`."
+        )
+    return start, args, h
+
+
+def positive_integer(name: str, count: Any) -> int:
+    """`count` as an `int`, from any integer type."""
+    try:
+        number = operator.index(count)
+    except TypeError:
+        number = 0
+    if number < 1 or isinstance(count, bool):
+        raise ValueError(f"`{name}` must be a positive integer, got {count!r}.")
+    return number
+
+
+def check_system(system: AbstractSystem, state: State, args: Args) -> tuple[State, Args]:
+    """Checks a system against a state and `args`, and makes arrays of their leaves."""
+    if not isinstance(system, AbstractSystem):
+        raise TypeError(f"`system` must be an `enerjax.System`, got {type(system)}.")
+    if not isinstance(state, State):
+        raise TypeError(
+            f"The start must be an `enerjax.State(q, v)`, got {type(state)}. "
+            "`initial_state` makes one that satisfies the constraints."
+        )
+    q, v = state.q, state.v
+    for name, x in (("q", q), ("v", v)):
+        if x.ndim != 1 or x.size == 0 or jnp.iscomplexobj(x):
+            raise ValueError(
+                f"`{name}` must be a real vector with at least one entry, got shape "
+                f"{x.shape} and dtype {x.dtype}."
+                + (" To run a batch use `jax.vmap`." if x.ndim > 1 else "")
+            )
+    if q.dtype != v.dtype:
+        raise TypeError(f"`q` is {q.dtype} and `v` is {v.dtype}: give both one dtype.")
+    if q.dtype == jnp.float32 and not jax.config.read("jax_enable_x64"):
+        _warn_single_precision()
+    args = jax.tree.map(lambda x: _as_array(x, q.dtype), args)
+    check_shapes(system, state, args)
+    if is_known((system, state, args)):
+        check_values(system, state, args)
+    return state, args
+
+
+@functools.cache
+def _warn_single_precision() -> None:
+    warnings.warn(
+        "This run is in float32: energies and constraints hold to about 1e-6 instead of "
+        "1e-15, and Newton's tolerances follow. For double precision run "
+        '`jax.config.update("jax_enable_x64", True)` before the first array is made.',
+        stacklevel=5,
+    )
+
+
+def _as_array(x: Any, dtype: Any) -> Any:
+    """Python floats become arrays: as they are, each new value would recompile."""
+    if isinstance(x, float | np.floating):
+        return jnp.asarray(x, dtype)
+    return jnp.asarray(x) if isinstance(x, np.ndarray) else x

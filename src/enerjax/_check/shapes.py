@@ -1,0 +1,114 @@
+"""Whether the functions of a system fit its state, before anything is evaluated."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from .._kinematics import ConfigurationKinematics
+from .._system import (
+    AbstractSystem,
+    HamiltonianSystem,
+    LagrangianSystem,
+    State,
+    System,
+)
+from .._types import Args
+
+
+def describe(role: str, fn: Any) -> str:
+    name = getattr(fn, "__name__", None)
+    return f"`{role}`" if name in (None, role, "<lambda>") else f"`{role}` (`{name}`)"
+
+
+def _shape(role: str, fn: Callable, *inputs: Any) -> tuple[int, ...]:
+    """Of the value of a function of the system, which must be a real array."""
+    out = eqx.filter_eval_shape(fn, *inputs)
+    if not hasattr(out, "shape") or not jnp.issubdtype(out.dtype, jnp.floating):
+        kind = out.dtype if hasattr(out, "dtype") else f"a Python {type(out).__name__}"
+        raise TypeError(
+            f"{describe(role, fn)} must return a real JAX array, got {kind}. Write it "
+            "with `jax.numpy` from its arguments: `0.0 * q[0]` is a zero of the right kind."
+        )
+    return out.shape
+
+
+def check_shapes(system: AbstractSystem, state: State, args: Args) -> None:
+    for role, fn, inputs in energies(system, state, args):
+        shape = _shape(role, fn, *inputs)
+        if shape != ():
+            raise ValueError(
+                f"{describe(role, fn)} must return a scalar, an energy, got shape {shape}."
+                + (" Sum over the bodies, or index the entry." if shape else "")
+            )
+    _rows("constraint", system.constraint, state, args)
+    if isinstance(system, System):
+        _check_separable(system, state, args)
+    elif state.q.size != state.v.size:
+        name = "momenta" if isinstance(system, HamiltonianSystem) else "velocities"
+        raise ValueError(
+            f"`q` has {state.q.size} entries and `v`, the {name}, has {state.v.size}: "
+            "give as many of each."
+        )
+
+
+def energies(
+    system: AbstractSystem, state: State, args: Args
+) -> list[tuple[str, Callable, tuple]]:
+    """The user's energy functions, their names, and what they are called with."""
+    q, v = state.q, state.v
+    if isinstance(system, HamiltonianSystem):
+        return [("hamiltonian", system.hamiltonian, (q, v, args))]
+    if isinstance(system, LagrangianSystem):
+        kinetic = ("kinetic", system.kinetic, (q, v, args))
+        return [("potential", system.potential, (q, args)), kinetic]
+    assert isinstance(system, System)
+    potential = ("potential", system.potential, (q, args))
+    if not callable(system.kinetic):
+        return [potential]
+    return [potential, ("kinetic", system.kinetic, (v, args))]
+
+
+def _rows(role: str, fn: Callable | None, state: State, args: Args) -> int:
+    """The number of rows of a constraint."""
+    if fn is None:
+        return 0
+    shape = _shape(role, fn, state.q, args)
+    if len(shape) != 1:
+        raise ValueError(
+            f"{describe(role, fn)} must return a vector, got shape {shape}. "
+            "Wrap a single constraint as `jnp.array([value])`."
+        )
+    return shape[0]
+
+
+def _check_separable(system: System, state: State, args: Args) -> None:
+    nq, nv = state.q.size, state.v.size
+    if not callable(system.kinetic) and system.kinetic.shape != (nv, nv):
+        raise ValueError(
+            f"The inertia matrix has shape {system.kinetic.shape}, but `v` has {nv} "
+            f"entries: give a ({nv}, {nv}) matrix."
+        )
+    redundant = _rows("coordinate_constraint", system.coordinate_constraint, state, args)
+    if not isinstance(system.kinematics, ConfigurationKinematics):
+        if nq != nv:
+            raise ValueError(
+                f"`q` has {nq} entries and `v` has {nv}. Without `kinematics` the "
+                "velocities are the rates of the coordinates: give as many of each, or "
+                "`System(..., kinematics=L)` with `v = L(q, args) qdot`."
+            )
+        return
+    fn = system.kinematics.matrix
+    shape = _shape("kinematics", fn, state.q, args)
+    if shape != (nv, nq):
+        raise ValueError(
+            f"{describe('kinematics', fn)} returned shape {shape}; `v = L qdot` with "
+            f"{nv} velocities and {nq} coordinates needs ({nv}, {nq})."
+        )
+    if redundant != nq - nv:
+        raise ValueError(
+            f"{nq} coordinates with {nv} velocities are redundant {nq - nv} times, but "
+            f"`coordinate_constraint` has {redundant} rows. Give "
+            "one row for each redundancy, such as `p @ p - 1` for a unit quaternion."
+        )

@@ -1,0 +1,91 @@
+"""Whether the numbers of a system make sense: finite energies, a regular inertia."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._system import AbstractSystem, HamiltonianSystem, State, System
+from .._tracing import is_known
+from .._types import Args
+from .shapes import describe, energies
+
+
+@eqx.filter_jit
+def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]:
+    inertia = system.inertia(state, args)
+    masses, eps = jnp.diagonal(inertia), 1e3 * jnp.finfo(inertia.dtype).eps
+    root = jnp.sqrt(jnp.where(masses > 0, masses, 1))
+    scaled = inertia / jnp.outer(root, root)
+    finite = lambda tree: jnp.all(
+        jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(tree)], bool)
+    )
+    constraints = [system.constraint]
+    if isinstance(system, System):
+        constraints.append(system.coordinate_constraint)
+    return dict(
+        start=finite(state),
+        args=finite([x for x in jax.tree.leaves(args) if eqx.is_inexact_array(x)]),
+        potential=finite(system.potential_energy(state, args)),
+        constraint=finite([f(state.q, args) for f in constraints if f is not None]),
+        inertia=finite(inertia),
+        quadratic=_is_quadratic(system, state, inertia, args),
+        symmetric=jnp.all(jnp.abs(scaled - scaled.T) <= eps),
+        definite=jnp.all(masses > 0) & finite(jnp.linalg.cholesky(scaled)),
+    )
+
+
+def _is_quadratic(
+    system: AbstractSystem, state: State, inertia: Array, args: Args
+) -> Array:
+    """Whether the kinetic energy is `1/2 v . inertia v`; a Hamiltonian need not be."""
+    if isinstance(system, HamiltonianSystem):
+        return jnp.array(True)
+    v = state.v
+    energy = lambda v: system.kinetic_energy(State(state.q, v), args)
+    # A probe with no symmetry, of the size of the velocities.
+    probe = (1 + jnp.max(jnp.abs(v))) * jnp.cos(jnp.arange(1, v.size + 1, dtype=v.dtype))
+    quadratic = 0.5 * probe @ inertia @ probe
+    error = jnp.abs(energy(probe) - quadratic) + jnp.abs(energy(-probe) - quadratic)
+    size = jnp.abs(probe) @ jnp.abs(inertia) @ jnp.abs(probe)
+    return error <= 1e3 * jnp.finfo(v.dtype).eps * size
+
+
+def check_values(system: AbstractSystem, state: State, args: Args) -> None:
+    facts = _facts(system, state, args)
+    if not is_known(facts):  # the functions of the system close over traced numbers
+        return
+    functions = {role: describe(role, fn) for role, fn, _ in energies(system, state, args)}
+    kinetic = functions.get("kinetic", functions.get("hamiltonian"))
+    inertia = "inertia matrix"
+    if kinetic is not None:
+        inertia = f"inertia (the Hessian of {kinetic})"
+    potential = functions.get("potential", kinetic)
+    for name, message in (
+        ("start", f"The start is not finite: q = {state.q}, v = {state.v}."),
+        ("args", f"`args` holds a number that is not finite: {args}."),
+        (
+            "potential",
+            f"{potential} is not finite at the start, q = {state.q}. Is it defined there?",
+        ),
+        ("constraint", "The constraints are not finite at the start. Defined there?"),
+        (
+            "inertia",
+            f"The {inertia} is not finite. A kinetic energy must have second derivatives "
+            "at `v = 0`: write `v @ v`, not the square of a norm.",
+        ),
+        (
+            "quadratic",
+            f"{kinetic} is not quadratic in the velocities: it must be `1/2 v . M v`, with "
+            "no linear or constant part, and `M` may depend on `q` only for "
+            "`System.from_lagrangian`. Other energies: `System.from_hamiltonian`.",
+        ),
+        ("symmetric", f"The {inertia} is not symmetric."),
+        (
+            "definite",
+            f"The {inertia} is not positive definite. A coordinate without mass, or a "
+            "negative mass? Every velocity needs some inertia.",
+        ),
+    ):
+        if not facts[name]:
+            raise ValueError(message)

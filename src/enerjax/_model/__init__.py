@@ -1,0 +1,17 @@
+from .._system import AbstractCanonicalSystem, AbstractSystem, State, System
+from .._types import Args
+from .base import (
+    AbstractModel as AbstractModel,
+    Drive as Drive,
+    Increment as Increment,
+)
+from .canonical import CanonicalModel as CanonicalModel
+from .separable import SeparableModel as SeparableModel
+
+
+def make_model(system: AbstractSystem, state: State, args: Args) -> AbstractModel:
+    """The model of a system; `state`, as the user has it, sets the scales."""
+    if isinstance(system, AbstractCanonicalSystem):
+        return CanonicalModel(system, state, args)
+    assert isinstance(system, System)
+    return SeparableModel(system, state, args)

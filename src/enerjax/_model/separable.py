@@ -1,0 +1,205 @@
+"""Constant inertia: velocities are eliminated by hand, and cost no unknowns.
+
+The drive in the momenta is `M^-1` times the mean momentum, and what `psi` adds. With
+`psi = C(q) v` linear in `v` its joint difference splits without any metric between
+positions and momenta,
+
+    psi_b - psi_a = [D_q (C v_m)] (q_b - q_a) + 1/2 (C_a + C_b) (v_b - v_a),
+
+which leaves `S_mu` free of the velocities at its end but for their mean: schemes solve it
+for them.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._discrete import AbstractDerivative
+from .._kinematics import IdentityKinematics
+from .._system import State, System
+from .._types import (
+    Args,
+    Coordinates,
+    JointMultipliers,
+    Multipliers,
+    Scalar,
+    Velocities,
+)
+from .base import AbstractModel, Drive, Increment, Scales
+
+
+class SeparableModel(AbstractModel):
+    """A `System` at fixed `args`; in its states `v` are the velocities."""
+
+    system: System
+    args: Args
+    inertia: Float[Array, "nv nv"]
+    inverse_inertia: Float[Array, "nv nv"]
+    scales: Scales
+
+    def __init__(self, system: System, state: State, args: Args):
+        self.system = system
+        self.args = args
+        self.inertia = system.inertia(state, args)
+        # Scaled to a unit diagonal first: a diagonal inertia is then inverted to the last
+        # digit, whatever the mass ratios are.
+        root = jnp.sqrt(jnp.diagonal(self.inertia))
+        scale = jnp.outer(root, root)
+        self.inverse_inertia = jnp.linalg.inv(self.inertia / scale) / scale
+        self.scales = self._scales(state)
+
+    @property
+    def has_own_momenta(self) -> bool:
+        return False
+
+    @property
+    def has_canonical_rates(self) -> bool:
+        return isinstance(self.system.kinematics, IdentityKinematics)
+
+    def enter(self, state: State) -> State:
+        return state
+
+    def leave(self, state: State) -> State:
+        return state
+
+    def kinetic(self, state: State) -> Scalar:
+        return self.kinetic_of(state.v)
+
+    def kinetic_of(self, v: Velocities) -> Scalar:
+        return 0.5 * v @ self.inertia @ v
+
+    def potential(self, state: State) -> Scalar:
+        return self._potential(state.q)
+
+    def _potential(self, q: Coordinates) -> Scalar:
+        return self.system.potential(q, self.args)
+
+    def gradient(self, state: State, h: Scalar) -> Drive:
+        return Drive(h * jax.grad(self._potential)(state.q), jnp.zeros((0,), h.dtype))
+
+    def coordinate(self, q: Coordinates) -> Float[Array, " ncc"]:
+        """The relations between redundant coordinates."""
+        if self.system.coordinate_constraint is None:
+            return jnp.zeros((0,), q.dtype)
+        return self.system.coordinate_constraint(q, self.args)
+
+    def constraint(self, q: Coordinates) -> Multipliers:
+        return jnp.concatenate([self.joint(q), self.coordinate(q)])
+
+    def push(self, qa: Coordinates, qb: Coordinates, rate: Coordinates) -> Velocities:
+        """`Lm rate`"""
+        return self.system.kinematics.push(0.5 * (qa + qb), rate, self.args)
+
+    def _pull(self, q: Coordinates, momentum: Velocities) -> Coordinates:
+        return self.system.kinematics.pull(q, momentum, self.args)
+
+    def lift(self, q: Coordinates, v: Velocities) -> Coordinates:
+        return self.system.kinematics.lift(q, v, jax.jacfwd(self.coordinate), self.args)
+
+    def drive(
+        self,
+        derivative: AbstractDerivative,
+        a: State,
+        b: State,
+        h: Scalar,
+        increment: Increment,
+    ) -> Drive:
+        mean_velocity = 0.5 * (a.v + b.v)
+
+        def action(q: Coordinates) -> Scalar:
+            out = h * self._potential(q)
+            if increment.impulse.size > 0:
+                out = out + increment.impulse @ self.constraint(q)
+            if increment.velocity_impulse.size > 0:
+                rate = self.joint_rate(q, mean_velocity)
+                out = out + h * increment.velocity_impulse @ rate
+            return out
+
+        impulse = derivative.gradient(action, a.q, b.q)
+        return Drive(impulse, jnp.zeros((0,), impulse.dtype))
+
+    def structure(
+        self, a: State, b: State, h: Scalar, rate: Coordinates, drive: Drive
+    ) -> Drive:
+        middle = 0.5 * (a.q + b.q)
+        change = self._pull(middle, self.inertia @ (b.v - a.v))
+        momentum = self.inertia @ (0.5 * (a.v + b.v))
+        gyroscopic = self.system.kinematics.gyroscopic(
+            middle, momentum, h * rate, self.args
+        )
+        if gyroscopic is not None:
+            change = change + gyroscopic
+        return Drive(change + drive.impulse, drive.drift)
+
+    def reaction(self, state: State, eta: JointMultipliers) -> Velocities:
+        return self.reaction_at(state.q, eta)
+
+    def reaction_at(self, q: Coordinates, eta: JointMultipliers) -> Velocities:
+        """`M^-1 C(q)^T eta`; as `psi` is linear in `v`, the same for every `v`."""
+        rest = jnp.zeros((self.inertia.shape[0],), q.dtype)
+        if eta.size == 0:
+            return rest
+        _, transpose = jax.vjp(lambda v: self.joint_rate(q, v), rest)
+        return self.inverse_inertia @ transpose(eta)[0]
+
+    def mean_reaction(
+        self, qa: Coordinates, qb: Coordinates, eta: JointMultipliers
+    ) -> Velocities:
+        """`D_mu (eta . psi) = 1/2 M^-1 (C_a + C_b)^T eta`"""
+        return 0.5 * (self.reaction_at(qa, eta) + self.reaction_at(qb, eta))
+
+    def metric(self, state: State) -> Float[Array, "nq nq"]:
+        """The inertia in the coordinates, made regular where they are redundant.
+
+        `L^T M L + sum_i g_i b_i b_i^T` with the gradients `b_i` of the coordinate
+        constraints, Euclidean along them: `g_i` gives them the mean inertia of a
+        coordinate, so the choice is independent of the units of the constraint.
+        """
+        if self.has_canonical_rates:
+            return self.inertia
+        q = state.q
+        pull = jax.vmap(self._pull, in_axes=(None, 0))
+        inertia = pull(q, pull(q, self.inertia).T)
+        rows = jax.jacfwd(self.coordinate)(q)
+        unit = rows / jnp.linalg.norm(rows, axis=1, keepdims=True)
+        return inertia + jnp.trace(inertia) / q.size * (unit.T @ unit)
+
+    def mobility(self, state: State) -> Float[Array, "nv nv"]:
+        return self.inverse_inertia
+
+    def stiffness(
+        self, state: State, multipliers: Multipliers
+    ) -> tuple[Float[Array, "nq nq"], Float[Array, "nq nq"]]:
+        strain = jax.hessian(lambda q: self.strain(q, multipliers))
+        return strain(state.q), self.inertia
+
+    def strain(self, q: Coordinates, multipliers: Multipliers) -> Scalar:
+        """`V + lambda . Phi`, the energy whose Hessian is the stiffness."""
+        return self._potential(q) + multipliers @ self.constraint(q)
+
+    def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
+        """The constraints enter twice differentiated; coordinate constraints have no
+        acceleration level of their own (their multipliers close the `nq` rows).
+        """
+        q, v = state.q, state.v
+        qdot = self.lift(q, v)
+        pull = jax.vmap(self._pull, in_axes=(None, 0))
+        force = -jax.grad(self._potential)(q)
+        gyroscopic = self.system.kinematics.gyroscopic(q, self.inertia @ v, qdot, self.args)
+        if gyroscopic is not None:
+            force = force - gyroscopic
+        jacobian = self.constraint_jacobian(q)
+        rate_jacobian = jax.jacfwd(self.joint_rate, argnums=1)(q, v)
+        _, drift = jax.jvp(lambda x: self.joint_rate(x, v), (q,), (qdot,))
+        num_joints = rate_jacobian.shape[0]
+        corner = jnp.zeros((num_joints, jacobian.shape[0]), q.dtype)
+        matrix = jnp.block([[pull(q, self.inertia).T, jacobian.T], [rate_jacobian, corner]])
+        scales = self.scales
+        rows = jnp.concatenate([1 / scales.coordinate, 1 / scales.constraint[:num_joints]])
+        columns = jnp.concatenate(
+            [1 / jnp.sqrt(jnp.diagonal(self.inertia)), 1 / scales.constraint]
+        )
+        scaled = rows[:, None] * matrix * columns[None, :]
+        right = rows * jnp.concatenate([force, -drift])
+        solution = columns * jnp.linalg.solve(scaled, right)
+        return solution[: v.size], solution[v.size :]

@@ -1,0 +1,7 @@
+from .base import AbstractSystem as AbstractSystem, State as State
+from .canonical import (
+    AbstractCanonicalSystem as AbstractCanonicalSystem,
+    HamiltonianSystem as HamiltonianSystem,
+    LagrangianSystem as LagrangianSystem,
+)
+from .separable import System as System

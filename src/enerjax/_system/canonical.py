@@ -1,0 +1,97 @@
+"""Systems of any kinetic energy, as the schemes see them: in `q` and momenta `p`."""
+
+import abc
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._types import Args, Coordinates, Multipliers, Scalar, Velocities
+from .base import AbstractSystem, check_function, State
+
+
+class AbstractCanonicalSystem(AbstractSystem):
+    """A system with a Hamiltonian `H(q, p)`."""
+
+    @abc.abstractmethod
+    def hamiltonian_and_rate(
+        self, q: Coordinates, p: Coordinates, args: Args
+    ) -> tuple[Scalar, Coordinates]:
+        """`H(q, p)` and `qdot = dH/dp`."""
+
+    @abc.abstractmethod
+    def momentum(self, state: State, args: Args) -> Coordinates:
+        """`p` of a state as the user gives it."""
+
+    @abc.abstractmethod
+    def velocity(self, q: Coordinates, p: Coordinates, args: Args) -> Velocities:
+        """The `v` of the state that the user is given."""
+
+
+class LagrangianSystem(AbstractCanonicalSystem):
+    """A system whose inertia depends on its coordinates: `System.from_lagrangian`."""
+
+    kinetic: Callable[[Coordinates, Velocities, Args], Scalar]
+    potential: Callable[[Coordinates, Args], Scalar]
+    constraint: Callable[[Coordinates, Args], Multipliers] | None = None
+
+    def __check_init__(self):
+        check_function("kinetic", "(q, qdot, args)", self.kinetic)
+        check_function("potential", "(q, args)", self.potential)
+        check_function("constraint", "(q, args)", self.constraint, optional=True)
+
+    def kinetic_energy(self, state: State, args: Args = None) -> Scalar:
+        return self.kinetic(state.q, state.v, args)
+
+    def potential_energy(self, state: State, args: Args = None) -> Scalar:
+        return self.potential(state.q, args)
+
+    def inertia(self, state: State, args: Args) -> Float[Array, "nq nq"]:
+        rest = jnp.zeros_like(state.q)
+        return jax.hessian(lambda qdot: self.kinetic(state.q, qdot, args))(rest)
+
+    def hamiltonian_and_rate(self, q, p, args):
+        rate = self.velocity(q, p, args)
+        return 0.5 * p @ rate + self.potential(q, args), rate
+
+    def momentum(self, state: State, args: Args) -> Coordinates:
+        return jax.grad(self.kinetic, argnums=1)(state.q, state.v, args)
+
+    def velocity(self, q: Coordinates, p: Coordinates, args: Args) -> Velocities:
+        return jnp.linalg.solve(self.inertia(State(q, p), args), p)
+
+
+class HamiltonianSystem(AbstractCanonicalSystem):
+    """A system given by its Hamiltonian: `System.from_hamiltonian`."""
+
+    hamiltonian: Callable[[Coordinates, Coordinates, Args], Scalar]
+    constraint: Callable[[Coordinates, Args], Multipliers] | None = None
+
+    def __check_init__(self):
+        check_function("hamiltonian", "(q, p, args)", self.hamiltonian)
+        check_function("constraint", "(q, args)", self.constraint, optional=True)
+
+    def kinetic_energy(self, state: State, args: Args = None) -> Scalar:
+        """`H(q, p) - H(q, 0)`"""
+        return self.energy(state, args) - self.potential_energy(state, args)
+
+    def potential_energy(self, state: State, args: Args = None) -> Scalar:
+        """`H(q, 0)`"""
+        return self.hamiltonian(state.q, jnp.zeros_like(state.v), args)
+
+    def energy(self, state: State, args: Args = None) -> Scalar:
+        return self.hamiltonian(state.q, state.v, args)
+
+    def inertia(self, state: State, args: Args) -> Float[Array, "nq nq"]:
+        hessian = jax.hessian(lambda p: self.hamiltonian(state.q, p, args))(state.v)
+        return jnp.linalg.inv(hessian)
+
+    def hamiltonian_and_rate(self, q, p, args):
+        return jax.value_and_grad(self.hamiltonian, argnums=1)(q, p, args)
+
+    def momentum(self, state: State, args: Args) -> Coordinates:
+        return state.v
+
+    def velocity(self, q: Coordinates, p: Coordinates, args: Args) -> Velocities:
+        return p
