@@ -163,9 +163,9 @@ class AbstractModel(eqx.Module):
             return jnp.zeros((0,), q.dtype)
         return self.system.constraint(q, self.args)
 
+    @abc.abstractmethod
     def constraint(self, q: Coordinates) -> Multipliers:
         """`Phi(q)`: joints first, then coordinate constraints."""
-        return self.joint(q)
 
     def constraint_jacobian(self, q: Coordinates) -> Float[Array, "nc nq"]:
         return jax.jacfwd(self.constraint)(q)

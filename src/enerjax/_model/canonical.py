@@ -52,6 +52,9 @@ class CanonicalModel(AbstractModel):
     def potential(self, state: State) -> Scalar:
         return self.system.potential_energy(state, self.args)
 
+    def constraint(self, q: Coordinates) -> Multipliers:
+        return self.joint(q)
+
     def lift(self, q: Coordinates, v: Velocities) -> Coordinates:
         return self.system.hamiltonian_and_rate(q, v, self.args)[1]
 

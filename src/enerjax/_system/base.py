@@ -56,9 +56,9 @@ class AbstractSystem(eqx.Module):
     def potential_energy(self, state: State, args: Args = None) -> Scalar:
         """The energy of one configuration at rest."""
 
+    @abc.abstractmethod
     def energy(self, state: State, args: Args = None) -> Scalar:
         """Total energy of one state."""
-        return self.kinetic_energy(state, args) + self.potential_energy(state, args)
 
     @abc.abstractmethod
     def inertia(self, state: State, args: Args) -> Float[Array, "nv nv"]:

@@ -47,6 +47,9 @@ class LagrangianSystem(AbstractCanonicalSystem):
     def potential_energy(self, state: State, args: Args = None) -> Scalar:
         return self.potential(state.q, args)
 
+    def energy(self, state: State, args: Args = None) -> Scalar:
+        return self.kinetic_energy(state, args) + self.potential_energy(state, args)
+
     def inertia(self, state: State, args: Args) -> Float[Array, "nq nq"]:
         rest = jnp.zeros_like(state.q)
         return jax.hessian(lambda qdot: self.kinetic(state.q, qdot, args))(rest)

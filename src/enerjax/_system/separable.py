@@ -88,6 +88,10 @@ class System(AbstractSystem):
         """`V(q)` of one state (energy)."""
         return self.potential(state.q, args)
 
+    def energy(self, state: State, args: Args = None) -> Scalar:
+        """Total energy `1/2 v . M v + V(q)` of one state."""
+        return self.kinetic_energy(state, args) + self.potential_energy(state, args)
+
     def inertia(self, state: State, args: Args) -> Float[Array, "nv nv"]:
         """`M`, constant."""
         if not callable(self.kinetic):

@@ -8,9 +8,20 @@ from ._base import Problem as Problem
 from ._pendulums import (
     chain as chain,
     double_pendulum as double_pendulum,
+    double_pendulum_angles as double_pendulum_angles,
     pendulum as pendulum,
     pendulum_angle as pendulum_angle,
     stiff_double_pendulum as stiff_double_pendulum,
 )
-from ._rigid_bodies import free_rigid_body as free_rigid_body, heavy_top as heavy_top
-from ._springs import four_particles as four_particles, spring_pendulum as spring_pendulum
+from ._rigid_bodies import (
+    free_rigid_body as free_rigid_body,
+    heavy_top as heavy_top,
+    heavy_top_canonical as heavy_top_canonical,
+    heavy_top_directors as heavy_top_directors,
+)
+from ._springs import (
+    elastic_pendulum as elastic_pendulum,
+    four_particles as four_particles,
+    spring_pendulum as spring_pendulum,
+    spring_ring as spring_ring,
+)

@@ -74,6 +74,30 @@ def double_pendulum(
     return problem(system, [l1, 0.0, l1, l2], [0.0] * 4, args)
 
 
+def _double_angle_kinetic(q: Coordinates, qdot: Velocities, args: Args) -> Scalar:
+    a, b = args["l1"] * qdot[0], args["l2"] * qdot[1]
+    outer = a**2 + b**2 + 2 * jnp.cos(q[1] - q[0]) * a * b
+    return 0.5 * (args["m1"] * a**2 + args["m2"] * outer)
+
+
+def _double_angle_potential(q: Coordinates, args: Args) -> Scalar:
+    inner = args["l1"] * jnp.cos(q[0])
+    outer = inner + args["l2"] * jnp.cos(q[1])
+    return -args["g"] * (args["m1"] * inner + args["m2"] * outer)
+
+
+def double_pendulum_angles(
+    m1: Real = 1.0, m2: Real = 1.0, l1: Real = 1.0, l2: Real = 1.0, g: Real = 9.81
+) -> Problem:
+    """Case c in its two angles from the vertical: no constraint, inertia that varies.
+
+    The same motion as `double_pendulum`, with `x1 = l1 sin(q[0])`, `y1 = l1 cos(q[0])`.
+    """
+    args = dict(m1=m1, m2=m2, l1=l1, l2=l2, g=g)
+    system = System.from_lagrangian(_double_angle_kinetic, _double_angle_potential)
+    return problem(system, [jnp.pi / 2, 0.0], [0.0, 0.0], args)
+
+
 def stiff_double_pendulum() -> Problem:
     """Case d: the double pendulum of case c with an inner mass 200 times lighter.
 

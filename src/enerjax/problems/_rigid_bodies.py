@@ -1,4 +1,6 @@
-"""Rigid bodies in Euler parameters, scalar first, rotating body axes into space."""
+"""Rigid bodies: in Euler parameters (scalar first, body axes into space), directors."""
+
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -72,6 +74,18 @@ def _top_rates(q: Coordinates, args: Args) -> Float[Array, "6 7"]:
     return jnp.block([[eye, off], [off[:, :3], _body_rates(q[3:])]])
 
 
+_TOP_SPIN = (0.0, 150.0, -4.61538)
+
+
+def _top_args() -> dict[str, Any]:
+    return dict(
+        m=15.0,
+        g=9.81,
+        J=jnp.array([0.234375, 0.46875, 0.234375]),
+        centre=jnp.array([0.0, 1.0, 0.0]),
+    )
+
+
 def heavy_top() -> Problem:
     """A fast heavy top on a spherical joint at the origin.
 
@@ -80,12 +94,6 @@ def heavy_top() -> Problem:
 
     **Source:** O. Bruls, A. Cardona and M. Arnold, Mech. Mach. Theory 48 (2012) 121-137.
     """
-    args = dict(
-        m=15.0,
-        g=9.81,
-        J=jnp.array([0.234375, 0.46875, 0.234375]),
-        centre=jnp.array([0.0, 1.0, 0.0]),
-    )
     system = System(
         _top_kinetic,
         _top_potential,
@@ -93,5 +101,66 @@ def heavy_top() -> Problem:
         kinematics=_top_rates,
         coordinate_constraint=_unit,
     )
-    spin = [0.0, 150.0, -4.61538]
-    return problem(system, [0.0, 1, 0, 1, 0, 0, 0], [4.61538, 0.0, 0.0, *spin], args)
+    v = [4.61538, 0.0, 0.0, *_TOP_SPIN]
+    return problem(system, [0.0, 1, 0, 1, 0, 0, 0], v, _top_args())
+
+
+def _about_joint(args: Args) -> Float[Array, "3 3"]:
+    """The inertia about the fixed point (Steiner)."""
+    centre = args["centre"]
+    away = centre @ centre * jnp.eye(3, dtype=centre.dtype) - jnp.outer(centre, centre)
+    return jnp.diag(args["J"]) + args["m"] * away
+
+
+def _director_kinetic(v: Velocities, args: Args) -> Scalar:
+    rates, inertia = v.reshape(3, 3), _about_joint(args)
+    euler = 0.5 * jnp.trace(inertia) * jnp.eye(3, dtype=v.dtype) - inertia
+    return 0.5 * jnp.sum(euler * (rates @ rates.T))
+
+
+def _director_potential(q: Coordinates, args: Args) -> Scalar:
+    return args["m"] * args["g"] * args["centre"] @ q.reshape(3, 3)[:, 2]
+
+
+def _orthonormal(q: Coordinates, args: Args) -> Multipliers:
+    directors = q.reshape(3, 3)
+    products = directors @ directors.T - jnp.eye(3, dtype=q.dtype)
+    return products[jnp.array([0, 1, 2, 1, 2, 2]), jnp.array([0, 1, 2, 0, 0, 1])]
+
+
+def heavy_top_directors() -> Problem:
+    """The top of `heavy_top` in its three body axes, as vectors in space.
+
+    `q` holds the axes one after another, `v` their rates; the mass centre is
+    `centre @ q.reshape(3, 3)`. With velocities that are rates of the coordinates, and
+    constraints that are products of vectors, the spatial angular momentum about the
+    vertical is kept to round-off.
+    """
+    args = _top_args()
+    system = System(_director_kinetic, _director_potential, _orthonormal)
+    rates = jnp.cross(jnp.array(_TOP_SPIN), jnp.eye(3))
+    return problem(system, jnp.eye(3).reshape(-1), rates.reshape(-1), args)
+
+
+def _quaternion_hamiltonian(q: Coordinates, p: Coordinates, args: Args) -> Scalar:
+    momentum = 0.25 * _body_rates(q) @ p
+    spin = jnp.linalg.solve(_about_joint(args), momentum)
+    height = _rotation(q)[2] @ args["centre"]
+    stretching = 0.5 * (q @ p) ** 2  # of the redundant momentum; vanishes in the motion
+    return 0.5 * momentum @ spin + stretching + args["m"] * args["g"] * height
+
+
+def _canonical_unit(q: Coordinates, args: Args) -> Multipliers:
+    return jnp.array([0.5 * (q @ q - 1)])
+
+
+def heavy_top_canonical() -> Problem:
+    """The top of `heavy_top` as a unit quaternion `q` and its momentum `p`.
+
+    `p = 2 E(q)^T J Omega` with the inertia `J` about the fixed point; `State.v` is `p`.
+    """
+    args = _top_args()
+    system = System.from_hamiltonian(_quaternion_hamiltonian, _canonical_unit)
+    q = jnp.array([1.0, 0, 0, 0])
+    p = _body_rates(q).T @ _about_joint(args) @ jnp.array(_TOP_SPIN)
+    return problem(system, q, p, args)

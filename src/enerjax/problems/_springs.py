@@ -53,3 +53,44 @@ def four_particles() -> Problem:
     v = jnp.zeros(12).at[11].set(2 / masses[3])
     system = System(_particles_kinetic, _particles_potential, _particles_rods)
     return problem(system, q, v, args)
+
+
+def _elastic_potential(q: Coordinates, args: Args) -> Scalar:
+    stretch = jnp.linalg.norm(q) - args["l"]
+    return 0.5 * args["k"] * stretch**2 + args["m"] * args["g"] * q[2]
+
+
+def elastic_pendulum(
+    m: Real = 1.0, l: Real = 1.0, k: Real = 100.0, g: Real = 9.81
+) -> Problem:
+    """A point in space on an elastic rod, that circles about the vertical.
+
+    Energy and the angular momentum about the vertical are conserved.
+    """
+    args = dict(m=m, l=l, k=k, g=g)
+    system = System(_spring_kinetic, _elastic_potential)
+    return problem(system, [l, 0.0, 0.0], [0.0, 2.0, 0.5], args)
+
+
+def _ring_potential(q: Coordinates, args: Args) -> Scalar:
+    x = q.reshape(-1, 3)
+    lengths = jnp.linalg.norm(x - jnp.roll(x, 1, axis=0), axis=1)
+    return 0.5 * args["k"] @ (lengths - args["l"]) ** 2
+
+
+def spring_ring(num_points: int = 6, k: Real = 100.0) -> Problem:
+    """Points of mass 1 in space on a ring of springs of length 1, that flies freely.
+
+    It turns about an inclined axis and waves across its plane. Energy, linear and angular
+    momentum are conserved.
+    """
+    angle = 2 * jnp.pi * jnp.arange(num_points) / num_points
+    radius = 0.5 / jnp.sin(jnp.pi / num_points)
+    x = radius * jnp.stack([jnp.cos(angle), jnp.sin(angle), 0 * angle], axis=1)
+    wave = jnp.stack([0 * angle, 0 * angle, 0.3 * jnp.cos(2 * angle)], axis=1)
+    v = jnp.cross(jnp.array([0.2, 0.0, 1.0]), x) + wave + jnp.array([0.1, 0.0, 0.2])
+    each = jnp.ones((num_points,))
+    args = dict(m=each, k=k * each, l=each)
+    return problem(
+        System(_particles_kinetic, _ring_potential), x.reshape(-1), v.reshape(-1), args
+    )
