@@ -27,6 +27,11 @@ PROBLEMS = {
     "top": ej.problems.heavy_top,
     "body": ej.problems.free_rigid_body,
     "particles": ej.problems.four_particles,
+    "double angles": ej.problems.double_pendulum_angles,
+    "top directors": ej.problems.heavy_top_directors,
+    "top canonical": ej.problems.heavy_top_canonical,
+    "ring": ej.problems.spring_ring,
+    "elastic": ej.problems.elastic_pendulum,
 }
 
 # sum m g r, the energy that a pendulum turns over: E0 is 0 in most of them.

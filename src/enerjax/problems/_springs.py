@@ -84,7 +84,7 @@ def spring_ring(num_points: int = 6, k: Real = 100.0) -> Problem:
     It turns about an inclined axis and waves across its plane. Energy, linear and angular
     momentum are conserved.
     """
-    angle = 2 * jnp.pi * jnp.arange(num_points) / num_points
+    angle = 2 * jnp.pi * jnp.arange(num_points, dtype=float) / num_points
     radius = 0.5 / jnp.sin(jnp.pi / num_points)
     x = radius * jnp.stack([jnp.cos(angle), jnp.sin(angle), 0 * angle], axis=1)
     wave = jnp.stack([0 * angle, 0 * angle, 0.3 * jnp.cos(2 * angle)], axis=1)
