@@ -1,8 +1,8 @@
 """Difference quotients of elementary functions, without cancellation.
 
 `quotient(a, b)` is `(f(b) - f(a)) / (b - a)`, and `f'(a)` at `b = a`, with all derivatives.
-The even functions at the bottom (`sin x / x` and its relatives) are summed as series near
-zero, so that neither they nor their derivatives lose digits there.
+The even functions at the bottom (`sin x / x` and its relatives) are series, so that neither
+they nor their derivatives lose digits near zero.
 """
 
 import math
@@ -17,20 +17,35 @@ from jaxtyping import Array
 Quotient = Callable[[Array, Array], Array]
 
 
+def _split(d: Array, near: Callable[[Array], Array], change: Array) -> Array:
+    """`near(d)` for small differences `d`, else `change / d`.
+
+    Beyond 1 that quotient loses no more than the rounding of the values; both of them are
+    at hand, so nothing is evaluated for it.
+    """
+    small = jnp.abs(d) < 1
+    quotient = change / jnp.where(small, 1, d)
+    return jnp.where(small, near(jnp.where(small, d, 0)), quotient)
+
+
 def sin(a: Array, b: Array) -> Array:
-    return jnp.cos(0.5 * (a + b)) * _sinc(0.5 * (b - a))
+    mean = jnp.cos(0.5 * (a + b))
+    return _split(b - a, lambda d: mean * _sinc(0.5 * d), jnp.sin(b) - jnp.sin(a))
 
 
 def cos(a: Array, b: Array) -> Array:
-    return -jnp.sin(0.5 * (a + b)) * _sinc(0.5 * (b - a))
+    mean = -jnp.sin(0.5 * (a + b))
+    return _split(b - a, lambda d: mean * _sinc(0.5 * d), jnp.cos(b) - jnp.cos(a))
 
 
 def tan(a: Array, b: Array) -> Array:
-    return _sinc(b - a) / (jnp.cos(a) * jnp.cos(b))
+    scale = jnp.cos(a) * jnp.cos(b)
+    return _split(b - a, lambda d: _sinc(d) / scale, jnp.tan(b) - jnp.tan(a))
 
 
 def exp(a: Array, b: Array) -> Array:
-    return jnp.exp(0.5 * (a + b)) * _sinhc(0.5 * (b - a))
+    mean = jnp.exp(0.5 * (a + b))
+    return _split(b - a, lambda d: mean * _sinhc(0.5 * d), jnp.exp(b) - jnp.exp(a))
 
 
 def exp2(a: Array, b: Array) -> Array:
@@ -39,15 +54,19 @@ def exp2(a: Array, b: Array) -> Array:
 
 
 def sinh(a: Array, b: Array) -> Array:
-    return jnp.cosh(0.5 * (a + b)) * _sinhc(0.5 * (b - a))
+    mean = jnp.cosh(0.5 * (a + b))
+    return _split(b - a, lambda d: mean * _sinhc(0.5 * d), jnp.sinh(b) - jnp.sinh(a))
 
 
 def cosh(a: Array, b: Array) -> Array:
-    return jnp.sinh(0.5 * (a + b)) * _sinhc(0.5 * (b - a))
+    mean = jnp.sinh(0.5 * (a + b))
+    return _split(b - a, lambda d: mean * _sinhc(0.5 * d), jnp.cosh(b) - jnp.cosh(a))
 
 
 def tanh(a: Array, b: Array) -> Array:
-    return (1 - jnp.tanh(a) * jnp.tanh(b)) * _tanhc(b - a)
+    tanh_a, tanh_b = jnp.tanh(a), jnp.tanh(b)
+    slope = 1 - tanh_a * tanh_b
+    return _split(b - a, lambda d: slope * _sinhc(d) / _cosh(d), tanh_b - tanh_a)
 
 
 def logistic(a: Array, b: Array) -> Array:
@@ -148,38 +167,30 @@ def smooth(function: Callable[[Array], Array], reach: float) -> Quotient:
     return quotient
 
 
-def _even(
-    series: Sequence[float], direct: Callable[[Array], Array], reach: float
-) -> Callable[[Array], Array]:
-    """An even function, by its series in `x**2` near zero."""
+def _even(series: Sequence[float]) -> Callable[[Array], Array]:
+    """An even function near zero, by its series in `x**2`."""
 
     def function(x: Array) -> Array:
-        near = jnp.abs(x) < reach
-        inner = jnp.where(near, x, 0) ** 2
-        total = jnp.zeros_like(x)
+        square, total = x * x, jnp.zeros_like(x)
         for coefficient in reversed(series):
-            total = total * inner + coefficient
-        return jnp.where(near, total, direct(jnp.where(near, 1, x)))
+            total = total * square + coefficient
+        return total
 
     return function
 
 
-def _tanhc(x: Array) -> Array:
-    near = jnp.abs(x) < 0.5
-    inner = jnp.where(near, x, 0)
-    outer = jnp.where(near, 1, x)
-    return jnp.where(near, _sinhc(inner) / jnp.cosh(inner), jnp.tanh(outer) / outer)
-
-
-def _odd_factorials(sign: int) -> list[float]:
-    return [sign**k / math.factorial(2 * k + 1) for k in range(10)]
+def _factorials(sign: int, first: int) -> list[float]:
+    return [sign**k / math.factorial(2 * k + first) for k in range(11)]
 
 
 def _odd_numbers(sign: int) -> list[float]:
     return [sign**k / (2 * k + 1) for k in range(16)]
 
 
-_sinc = _even(_odd_factorials(-1), lambda x: jnp.sin(x) / x, 0.5)
-_sinhc = _even(_odd_factorials(1), lambda x: jnp.sinh(x) / x, 0.5)
-_atanc = _even(_odd_numbers(-1), lambda x: jnp.arctan(x) / x, 0.3)
-_atanhc = _even(_odd_numbers(1), lambda x: jnp.arctanh(x) / x, 0.3)
+# For |x| < 1.
+_sinc = _even(_factorials(-1, 1))
+_sinhc = _even(_factorials(1, 1))
+_cosh = _even(_factorials(1, 0))
+# For |x| < 1/4.
+_atanc = _even(_odd_numbers(-1))
+_atanhc = _even(_odd_numbers(1))

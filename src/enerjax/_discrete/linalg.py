@@ -145,5 +145,5 @@ def lu(values: list[Value], params: dict[str, Any]) -> list[Value]:
     squares, decided = jnp.sum(moved**2), jnp.sum(moved * matrix.d)
     shared = (fb - fa) * decided / jnp.where(squares > 0, squares, 1)
     factors = Moving(fa, fb, jnp.where(same, exact, shared))
-    decides = [jnp.broadcast_to(x, pa.shape) for x in (squares, decided)]
+    decides = [jnp.broadcast_to(x.astype(float), pa.shape) for x in (squares, decided)]
     return [factors, Switching(pa, pb, *decides), Switching(ra, rb, *decides)]

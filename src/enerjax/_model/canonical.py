@@ -88,8 +88,9 @@ class CanonicalModel(AbstractModel):
             return out
 
         # Lengths of positions and momenta have no common measure but by a time.
-        unit = self.scales.coordinate
-        weights = jnp.concatenate([unit**2, (h / unit) ** 2])
+        middle = 0.5 * (a.q + b.q), 0.5 * (a.v + b.v)
+        masses = self.system.masses(*middle, self.args)
+        weights = jnp.concatenate([masses, h**2 / masses])
         ends = (jnp.concatenate([x.q, x.v]) for x in (a, b))
         both = derivative.gradient(action, *ends, weights=weights)
         return Drive(both[:size], both[size:] / h)

@@ -21,6 +21,10 @@ class AbstractCanonicalSystem(AbstractSystem):
         """`H(q, p)` and `qdot = dH/dp`."""
 
     @abc.abstractmethod
+    def masses(self, q: Coordinates, p: Coordinates, args: Args) -> Coordinates:
+        """A mass for each coordinate, to measure increments of `q` and `p` together."""
+
+    @abc.abstractmethod
     def momentum(self, state: State, args: Args) -> Coordinates:
         """`p` of a state as the user gives it."""
 
@@ -58,6 +62,9 @@ class LagrangianSystem(AbstractCanonicalSystem):
         rate = self.velocity(q, p, args)
         return 0.5 * p @ rate + self.potential(q, args), rate
 
+    def masses(self, q, p, args):
+        return jnp.diagonal(self.inertia(State(q, p), args))
+
     def momentum(self, state: State, args: Args) -> Coordinates:
         return jax.grad(self.kinetic, argnums=1)(state.q, state.v, args)
 
@@ -87,8 +94,13 @@ class HamiltonianSystem(AbstractCanonicalSystem):
         return self.hamiltonian(state.q, state.v, args)
 
     def inertia(self, state: State, args: Args) -> Float[Array, "nq nq"]:
-        hessian = jax.hessian(lambda p: self.hamiltonian(state.q, p, args))(state.v)
-        return jnp.linalg.inv(hessian)
+        return jnp.linalg.inv(self._compliance(state.q, state.v, args))
+
+    def _compliance(self, q: Coordinates, p: Coordinates, args: Args) -> Array:
+        return jax.hessian(self.hamiltonian, argnums=1)(q, p, args)
+
+    def masses(self, q, p, args):
+        return 1 / jnp.diagonal(self._compliance(q, p, args))
 
     def hamiltonian_and_rate(self, q, p, args):
         return jax.value_and_grad(self.hamiltonian, argnums=1)(q, p, args)

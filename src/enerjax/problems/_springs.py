@@ -88,7 +88,7 @@ def spring_ring(num_points: int = 6, k: Real = 100.0) -> Problem:
     radius = 0.5 / jnp.sin(jnp.pi / num_points)
     x = radius * jnp.stack([jnp.cos(angle), jnp.sin(angle), 0 * angle], axis=1)
     wave = jnp.stack([0 * angle, 0 * angle, 0.3 * jnp.cos(2 * angle)], axis=1)
-    v = jnp.cross(jnp.array([0.2, 0.0, 1.0]), x) + wave + jnp.array([0.1, 0.0, 0.2])
+    v = jnp.cross(jnp.array([0.2, 0.0, 1.0]), x) + wave + jnp.array([[0.1, 0.0, 0.2]])
     each = jnp.ones((num_points,))
     args = dict(m=each, k=k * each, l=each)
     return problem(
