@@ -1,8 +1,12 @@
 """Schemes cannot be made from numbers that they are not defined for."""
 
+import jax
+import jax.numpy as jnp
 import pytest
 
 import enerjax as ej
+
+from .helpers import problem
 
 
 @pytest.mark.parametrize(
@@ -46,3 +50,42 @@ def test_a_scheme_cannot_be_made_from_what_it_does_not_know(make, message, is_ty
         pytest.skip("the type checker refuses it first")
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize("scheme", [ej.EnergyPreserving, ej.EnergyConsistent])
+def test_a_derivative_without_parentheses(scheme):
+    numbers = () if scheme is ej.EnergyPreserving else (0.5,)
+    with pytest.raises(TypeError, match="parentheses"):
+        scheme(*numbers, derivative=ej.ChainRule)  # pyright: ignore
+
+
+def test_what_a_step_is_given_must_fit():
+    system, start, args = problem("pendulum")
+    one = ej.step(system, ej.EnergyPreserving(), start, args, h=0.01)
+    with pytest.raises(ValueError, match="`warm` is not of this scheme"):
+        ej.step(system, ej.EnergyDecaying(0.5), start, args, h=0.01, warm=one.warm)
+    with pytest.raises(TypeError, match="root finder"):
+        ej.step(
+            system,
+            ej.EnergyPreserving(),
+            start,
+            args,
+            h=0.01,
+            root_finder=ej.Newton,  # pyright: ignore
+        )
+
+
+def test_numbers_inside_jit_are_checked_where_they_are_constants():
+    system, start, args = problem("pendulum")
+
+    @jax.jit
+    def run(h):
+        scheme = ej.Composed(ej.EnergyConsistent(0.0), 6)
+        return ej.simulate(system, scheme, start, args, h=h, num_steps=2).ys.q
+
+    assert bool(jnp.all(jnp.isfinite(run(0.01))))
+    with pytest.raises(ValueError, match="alpha"):
+        jax.jit(lambda h: ej.EnergyDecaying(-1.0).alpha * h)(0.1)
+    vector = ej.EnergyDecaying(jnp.array([0.1, 0.2]))
+    with pytest.raises(ValueError, match=r"jax\.vmap"):
+        ej.simulate(system, vector, start, args, h=0.01, num_steps=2)

@@ -164,4 +164,4 @@ def test_as_many_momenta_as_coordinates():
     with pytest.raises(ValueError, match="as many of each"):
         ej.initial_state(system, [1.0, 2.0], [0.5])
     with pytest.raises(TypeError, match="`hamiltonian` must be a function of"):
-        ej.System.from_hamiltonian(jnp.eye(2))
+        ej.System.from_hamiltonian(jnp.eye(2))  # pyright: ignore

@@ -176,3 +176,32 @@ def test_integers_and_lists_are_taken_for_vectors():
     same = ej.initial_state(system, [1, 0], (0, 0), args)
     np.testing.assert_array_equal(same.q, start.q)
     assert same.v.dtype == start.v.dtype
+
+
+def test_a_light_slow_body_beside_a_heavy_fast_one():
+    """Each unknown is judged by itself: the pendulum holds its rod all the same."""
+
+    def kinetic(v, args):
+        return 0.5e-6 * v[:2] @ v[:2] + 0.5e6 * v[2] ** 2
+
+    rod = lambda q, args: jnp.array([q[:2] @ q[:2] - 1.0])
+    system = ej.System(kinetic, lambda q, args: -9.81e-6 * q[1], rod)
+    start = ej.initial_state(system, [1.0, 0.0, 0.0], [0.0, 0.0, 1e4])
+    run = ej.simulate(system, ej.EnergyPreserving(), start, h=0.01, num_steps=50)
+    assert float(jnp.max(jnp.abs(run.audit.constraint))) <= 1e-13  # solver
+    alone = ej.System(1e-6 * jnp.eye(2), lambda q, args: -9.81e-6 * q[1], rod)
+    start = ej.initial_state(alone, [1.0, 0.0], [0.0, 0.0])
+    single = ej.simulate(alone, ej.EnergyPreserving(), start, h=0.01, num_steps=50)
+    np.testing.assert_allclose(run.ys.q[-1, :2], single.ys.q[-1], rtol=1e-11)
+
+
+def test_far_from_the_origin_a_wrong_length_is_still_seen():
+    far = jnp.array([1e6, 0.0])
+    rod = lambda q, args: jnp.array([(q - far) @ (q - far) - args])
+    system = ej.System(jnp.eye(2), lambda q, args: -9.81 * q[1], rod)
+    start = ej.State(far + jnp.array([1.0, 0.0]), [0.0, 0.0])
+    run = lambda square: ej.simulate(
+        system, ej.EnergyPreserving(), start, square, h=0.01, num_steps=50, throw=False
+    )
+    assert run(1.0).result == ej.RESULTS.successful
+    assert run(1.0 + 1e-3).result == ej.RESULTS.inconsistent_start

@@ -151,17 +151,16 @@ PROGRAMS = dict(
     point=st.lists(st.floats(-2, 2, width=16), min_size=2 * SIZE, max_size=2 * SIZE),
     increment=st.sampled_from(INCREMENTS),
 )
-REPEATABLE = dict(deadline=None, derandomize=True, database=None)
 
 
-@settings(max_examples=30, **REPEATABLE)
+@settings(max_examples=30, deadline=None, derandomize=True, database=None)
 @given(**PROGRAMS)
 def test_the_identity_holds_on_random_programs(steps, point, increment):
     _check(steps, point, increment)
 
 
 @pytest.mark.slow
-@settings(max_examples=500, **REPEATABLE)
+@settings(max_examples=500, deadline=None, derandomize=True, database=None)
 @given(**PROGRAMS)
 def test_the_identity_holds_on_many_random_programs(steps, point, increment):
     _check(steps, point, increment)

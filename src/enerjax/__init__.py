@@ -30,7 +30,11 @@ from ._schemes import (
 from ._simulate import simulate as simulate
 from ._solution import Solution as Solution, Statistics as Statistics
 from ._step import step as step, StepOutput as StepOutput, Warm as Warm
-from ._system import State as State, System as System
+from ._system import (
+    AbstractSystem as AbstractSystem,
+    State as State,
+    System as System,
+)
 
 
 __version__ = _version("enerjax")

@@ -72,7 +72,7 @@ def simulate(
         raise ValueError(
             f"`num_steps` ({num_steps}) must be a multiple of `save_every` ({save_every})."
         )
-    start, args, h = prepare(system, scheme, start, args, h)
+    start, args, h = prepare(system, scheme, start, args, h, root_finder)
     solution = _run(system, scheme, start, args, h, root_finder, num_steps, save_every)
     return _raise_failure(solution, h) if throw else solution
 

@@ -115,10 +115,21 @@ def advance(
 def _single_step(system, scheme, state, args, h, warm, root_finder):
     model = make_model(system, state, args)
     state = model.enter(state)
+    fresh = lambda: first_warm(scheme, model, state, h, *model.accelerations(state))
     if warm is None:
-        warm = first_warm(scheme, model, state, h, *model.accelerations(state))
+        warm = fresh()
+    elif _kinds(warm) != _kinds(eqx.filter_eval_shape(fresh)):
+        raise ValueError(
+            "`warm` is not of this scheme and system. Pass the `warm` of the step before, "
+            "or none."
+        )
     out = advance(scheme, model, state, h, warm, root_finder, jnp.array(False))
     return eqx.tree_at(lambda out: out.state, out, model.leave(out.state))
+
+
+def _kinds(tree: PyTree[Any]) -> Any:
+    leaves, structure = jax.tree.flatten(tree)
+    return structure, [(jnp.shape(x), jnp.result_type(x)) for x in leaves]
 
 
 def step(
@@ -150,7 +161,7 @@ def step(
 
     **Raises:** `ValueError` or `TypeError` for wrong shapes, types and signs.
     """
-    state, args, h = prepare(system, scheme, state, args, h)
+    state, args, h = prepare(system, scheme, state, args, h, root_finder)
     return _single_step(system, scheme, state, args, h, warm, root_finder)
 
 

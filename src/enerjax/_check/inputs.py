@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 
 from .._schemes import AbstractScheme
 from .._system import AbstractSystem, State
@@ -22,9 +23,19 @@ from .values import check_values
 
 
 def prepare(
-    system: AbstractSystem, scheme: AbstractScheme, start: State, args: Args, h: Real
+    system: AbstractSystem,
+    scheme: AbstractScheme,
+    start: State,
+    args: Args,
+    h: Real,
+    root_finder: optx.AbstractRootFinder,
 ) -> tuple[State, Args, Scalar]:
     """Checked start, `args` of arrays, and `h` in the dtype of the start."""
+    if not isinstance(root_finder, optx.AbstractRootFinder):
+        raise TypeError(
+            "`root_finder` must be a root finder such as `enerjax.Newton()` or one of "
+            f"optimistix, got {root_finder!r}."
+        )
     if not isinstance(scheme, AbstractScheme):
         raise TypeError(
             f"`scheme` must be a scheme such as `EnergyPreserving()`, got {scheme!r}"

@@ -161,3 +161,13 @@ def check_formulation(scheme: str, formulation: str) -> None:
             f'`{scheme}(formulation={formulation!r})`: use "ggl" (joints held at position '
             'and velocity level) or "index3" (position level only).'
         )
+
+
+def check_derivative(scheme: str, derivative: Any) -> None:
+    if not isinstance(derivative, AbstractDerivative):
+        missing = isinstance(derivative, type)
+        raise TypeError(
+            f"`{scheme}(derivative=...)` must be a discrete derivative such as "
+            f"`ChainRule()`, got {derivative!r}"
+            + (": the parentheses are missing." if missing else ".")
+        )

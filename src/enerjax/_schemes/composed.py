@@ -12,9 +12,8 @@ class Composed(AbstractScheme):
 
     - Conserves, constraints held at: as the composed scheme.
     - Order: `order`, 4, 6 or 8 (above that of the scheme).
-      Needs a smooth discrete gradient: where `V` is not quadratic give the scheme
-      `derivative=ChainRule()` or `MeanValue()`; the correction of `Gonzalez()` spoils
-      orders 6 and 8.
+      Needs a smooth discrete gradient: where `V` is not quadratic the correction of
+      `Gonzalez()` spoils orders 6 and 8.
     - Cost: one solve a stage. From order 2: 5, 9 and 17 stages for orders 4, 6 and 8; from
       order 4 (`EnergyConsistent(0.0)`): 5 and 9 for orders 6 and 8.
 

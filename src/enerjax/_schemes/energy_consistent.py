@@ -12,7 +12,13 @@ from .._tracing import is_known
 from .._types import Coordinates, Multipliers, Real, Scalar, Velocities
 from ._decaying import alpha_from_spectral_radius, as_alpha
 from ._semidefinite import semidefinite_part
-from .base import AbstractSingleSolve, Formulation, StepEnd, StepProblem
+from .base import (
+    AbstractSingleSolve,
+    check_derivative,
+    Formulation,
+    StepEnd,
+    StepProblem,
+)
 
 
 class _Frozen(eqx.Module):
@@ -52,7 +58,7 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
       positive part there is nothing to damp, and nothing is removed.
     - Constraints held at: position and velocity level.
     - Order: 4 at `alpha = 0` (then symmetric: `Composed` raises it to 6 or 8), else 3;
-      2 where the `derivative` is `Gonzalez()` and `V` is not quadratic.
+      2 where the `derivative` is no `MeanValue()` and `V` is not quadratic.
     - Needs canonical coordinates, `v = qdot` or momenta: with `kinematics` use
       `EnergyPreserving` or `EnergyDecaying`.
 
@@ -74,6 +80,9 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
 
     alpha: Scalar = eqx.field(converter=as_alpha)
     derivative: AbstractDerivative = MeanValue(points=2)
+
+    def __check_init__(self):
+        check_derivative("EnergyConsistent", self.derivative)
 
     @classmethod
     def from_spectral_radius(

@@ -16,6 +16,7 @@ from ._decaying import (
 )
 from .base import (
     AbstractSingleSolve,
+    check_derivative,
     check_formulation,
     Formulation,
     StepEnd,
@@ -65,6 +66,7 @@ class EnergyDecaying(AbstractSingleSolve[JumpAndEnd, StepProblem]):
 
     def __check_init__(self):
         check_formulation("EnergyDecaying", self.formulation)
+        check_derivative("EnergyDecaying", self.derivative)
 
     @classmethod
     def from_spectral_radius(

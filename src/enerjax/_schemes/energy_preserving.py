@@ -8,6 +8,7 @@ from .._system import State
 from .._types import Multipliers, Scalar, Velocities
 from .base import (
     AbstractSingleSolve,
+    check_derivative,
     check_formulation,
     Formulation,
     StepEnd,
@@ -42,6 +43,7 @@ class EnergyPreserving(AbstractSingleSolve[Increment, StepProblem]):
 
     def __check_init__(self):
         check_formulation("EnergyPreserving", self.formulation)
+        check_derivative("EnergyPreserving", self.derivative)
 
     @property
     def order(self) -> int:

@@ -16,7 +16,13 @@ from ._decaying import (
     predict_jump_and_end,
     split_velocities,
 )
-from .base import AbstractSingleSolve, Formulation, StepEnd, StepProblem
+from .base import (
+    AbstractSingleSolve,
+    check_derivative,
+    Formulation,
+    StepEnd,
+    StepProblem,
+)
 
 
 class _Unknowns(eqx.Module):
@@ -56,6 +62,9 @@ class KappaDecaying(AbstractSingleSolve[_Unknowns, StepProblem]):
 
     alpha: Scalar = eqx.field(converter=as_alpha)
     derivative: AbstractDerivative = ChainRule()
+
+    def __check_init__(self):
+        check_derivative("KappaDecaying", self.derivative)
 
     @property
     def order(self) -> int:

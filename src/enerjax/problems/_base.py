@@ -1,7 +1,7 @@
 from typing import NamedTuple
 
 from .._initial import initial_state
-from .._system import State, System
+from .._system import AbstractSystem, State
 from .._types import Args, Vector
 
 
@@ -11,10 +11,10 @@ class Problem(NamedTuple):
     Use as `system, start, args = pendulum()`.
     """
 
-    system: System
+    system: AbstractSystem
     start: State
     args: Args
 
 
-def problem(system: System, q: Vector, v: Vector, args: Args) -> Problem:
+def problem(system: AbstractSystem, q: Vector, v: Vector, args: Args) -> Problem:
     return Problem(system, initial_state(system, q, v, args), args)
