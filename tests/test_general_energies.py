@@ -159,6 +159,15 @@ def test_bad_energies_are_told(system, message):
         ej.initial_state(system, [1.0, 2.0], [0.5, 0.1])
 
 
+def test_functions_of_the_wrong_number_of_arguments():
+    system = ej.System.from_lagrangian(
+        lambda v, args: v @ v,  # pyright: ignore
+        lambda q, args: q @ q,
+    )
+    with pytest.raises(TypeError, match=r"must take 3 arguments, .*\(q, qdot, args\)"):
+        ej.initial_state(system, [1.0], [0.5])
+
+
 def test_as_many_momenta_as_coordinates():
     system = ej.System.from_hamiltonian(lambda q, p, args: q @ q + p @ p)
     with pytest.raises(ValueError, match="as many of each"):

@@ -5,7 +5,6 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from ._check import check_system
@@ -149,10 +148,8 @@ def _project_position(model: AbstractModel, state: State) -> tuple[Coordinates, 
 
     zero = (jnp.zeros_like(guess), jnp.zeros_like(scales.constraint))
     tolerance = 1e2 * jnp.finfo(guess.dtype).eps
-    x, _, result = find_root(
-        conditions, Newton(), zero, (model, metric, guess), max_iterations=50
-    )
-    found = result == optx.RESULTS.successful
+    root = find_root(conditions, Newton(), zero, (model, metric, guess), max_iterations=50)
+    x, found = root.value, root.found
     # Constraints that are met are not far; whether they are independent is told apart.
     met = jnp.max(jnp.abs(conditions(zero, (model, metric, guess))[1])) <= tolerance
     near = met | (found & _linear(model, metric, guess))

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ._linear import inverse
 from ._types import Args, Coordinates, Velocities
 
 
@@ -72,25 +73,10 @@ class ConfigurationKinematics(AbstractKinematics):
 
     def lift(self, q, v, coordinate_jacobian, args):
         square = jnp.concatenate([self.matrix(q, args), coordinate_jacobian(q)])
-        return _inverse(square)[:, : v.size] @ v
+        return inverse(square)[:, : v.size] @ v
 
     def gyroscopic(self, q, momentum, dq, args):
         # G_ij = sum_k mu_k (dL_ki/dq_j - dL_kj/dq_i), paper eq. (11), applied to dq:
         # the change of L^T mu along dq minus the gradient of mu . L dq.
         _, along = jax.jvp(lambda x: self.pull(x, momentum, args), (q,), (dq,))
         return along - jax.grad(lambda x: momentum @ self.push(x, dq, args))(q)
-
-
-@jax.custom_jvp
-def _inverse(x: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    return jnp.linalg.inv(x)
-
-
-@_inverse.defjvp
-def _inverse_jvp(primals, tangents):
-    # The schemes differentiate `lift` up to three times. With this rule that costs
-    # matrix products; differentiating a linear solve costs a solve each time, and
-    # several times the compilation.
-    (x,), (dx,) = primals, tangents
-    y = _inverse(x)
-    return y, -y @ dx @ y

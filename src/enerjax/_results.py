@@ -1,7 +1,8 @@
 """How a step can end. Failures are values: each step of each lane carries one."""
 
 import equinox as eqx
-import optimistix as optx
+
+from ._types import Flag
 
 
 class RESULTS(eqx.Enumeration):
@@ -36,9 +37,7 @@ def first_failure(old: RESULTS, new: RESULTS) -> RESULTS:
     return RESULTS.where(old == RESULTS.successful, new, old)
 
 
-def from_root_finder(result: optx.RESULTS) -> RESULTS:
-    """What an optimistix outcome means for a step."""
-    broken = (result == optx.RESULTS.nonfinite) | (result == optx.RESULTS.singular)
+def from_root_finder(found: Flag, broken: Flag) -> RESULTS:
+    """What the end of an iteration means for a step."""
     failure = RESULTS.where(broken, RESULTS.nonfinite, RESULTS.not_converged)
-    okay = result == optx.RESULTS.successful
-    return RESULTS.where(okay, RESULTS.successful, failure)
+    return RESULTS.where(found, RESULTS.successful, failure)

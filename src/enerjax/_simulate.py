@@ -1,12 +1,11 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 
 from ._audit import audit
 from ._check import positive_integer, prepare
 from ._model import AbstractModel, make_model
-from ._newton import Newton
+from ._newton import Newton, RootFinder
 from ._results import first_failure, RESULTS
 from ._schemes import AbstractScheme
 from ._solution import Solution, Statistics
@@ -34,7 +33,7 @@ def simulate(
     h: Real,
     num_steps: int,
     save_every: int = 1,
-    root_finder: optx.AbstractRootFinder = Newton(),
+    root_finder: RootFinder = Newton(),
     throw: bool = True,
 ) -> Solution:
     """Integrate `num_steps` steps of length `h` from `start`.
@@ -55,8 +54,8 @@ def simulate(
     - `num_steps`, `save_every`: every `save_every`-th state is saved, and the start. Their
       quotient must be whole. In reverse mode the steps between two saves are computed
       again instead of stored.
-    - `root_finder`: an optimistix root finder for the step equations, which are scaled
-      to order one (so tolerances are relative).
+    - `root_finder`: for the step equations, which are scaled to order one (so tolerances
+      are relative); one of optimistix can be given.
     - `throw`: raise an error at the end of a run that failed, which names the step, the
       time and the cause (under `jit`, `vmap` and `grad` the cause alone, and for all
       lanes together). With `False` look at `result`: rows after the failure are NaN.

@@ -10,12 +10,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
+from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
 from ._check import prepare
+from ._linear import AbstractFactors, empty_factors
 from ._model import AbstractModel, make_model
-from ._newton import find_root, max_norm, Newton
+from ._newton import find_root, max_norm, Newton, RootFinder
 from ._results import first_failure, from_root_finder, RESULTS
 from ._scaling import scales_like
 from ._schemes import AbstractScheme, AbstractSingleSolve
@@ -28,12 +29,16 @@ MAX_ITERATIONS = 50
 
 
 class Warm(eqx.Module):
-    """What the last three steps added to a free flight, newest first, for each stage.
+    """What the last steps leave for the next, for each stage.
 
     Pass it from one `step` to the next, with the same `h`, to start Newton closer.
+
+    - `added`: what the last three steps added to a free flight, newest first.
+    - `factors`: of the Jacobian of the last step.
     """
 
     added: PyTree[Any]
+    factors: AbstractFactors
 
 
 class StepOutput(eqx.Module):
@@ -71,10 +76,12 @@ def first_warm(
         problem = scheme.stage.problem(model, start, length * h)
         z = scheme.stage.predict(problem, acceleration, multipliers)
         flight = _free_flight(scheme.stage, problem, model, start)
-        return jax.tree.map(lambda x, x0: jnp.stack([x - x0] * 3), z, flight)
+        added = jax.tree.map(lambda x, x0: jnp.stack([x - x0] * 3), z, flight)
+        flat, _ = ravel_pytree(flight)
+        return Warm(added, empty_factors(flat.size, flat.dtype))
 
     lengths = jnp.asarray(scheme.stages, h.dtype)
-    return Warm(jax.vmap(predict)(lengths))
+    return jax.vmap(predict)(lengths)
 
 
 def advance(
@@ -83,7 +90,7 @@ def advance(
     start: State,
     h: Scalar,
     warm: Warm,
-    root_finder: optx.AbstractRootFinder,
+    root_finder: RootFinder,
     skip: Flag,
 ) -> StepOutput:
     """One step of a scheme, without checks. With `skip` it costs no iteration."""
@@ -97,7 +104,7 @@ def advance(
         return end.state, (length, reported, memory)
 
     lengths = jnp.asarray(scheme.stages, h.dtype)
-    state, (lengths, reported, memory) = jax.lax.scan(stage, start, (lengths, warm.added))
+    state, (lengths, reported, memory) = jax.lax.scan(stage, start, (lengths, warm))
     multipliers, dissipated, details, iterations, results = reported
     return StepOutput(
         state,
@@ -107,7 +114,7 @@ def advance(
         jax.tree.map(lambda x: x[-1], details),
         jnp.sum(iterations),
         _first_of(results),
-        Warm(memory),
+        memory,
     )
 
 
@@ -140,7 +147,7 @@ def step(
     *,
     h: Real,
     warm: Warm | None = None,
-    root_finder: optx.AbstractRootFinder = Newton(),
+    root_finder: RootFinder = Newton(),
 ) -> StepOutput:
     """Advance one state by one step of length `h`, for loops of your own.
 
@@ -170,8 +177,8 @@ def _solve(
     model: AbstractModel,
     start: State,
     h: Scalar,
-    memory: PyTree[Any],
-    root_finder: optx.AbstractRootFinder,
+    memory: Warm,
+    root_finder: RootFinder,
     skip: Flag,
 ):
     problem = scheme.problem(model, start, h)
@@ -186,16 +193,20 @@ def _solve(
     inputs = (scheme, problem, unknown_scale, row_scale)
 
     # Smooth motion is met by extrapolation; where it changes quickly the last step is
-    # the better guess. Two residuals are cheap beside one Jacobian.
-    def extrapolate(weights):
-        blend = lambda x0, x, unit: (x0 + weights @ x) / unit
-        guess = jax.tree.map(blend, flight, memory, unknown_scale)
+    # the better guess. Two residuals are cheap beside one Jacobian. (One after the other:
+    # together they would make matrix products, see `plain_products`.)
+    def extrapolate(*weights):
+        blend = lambda x0, x, unit: (
+            (x0 + sum(w * x[k] for k, w in enumerate(weights))) / unit
+        )
+        guess = jax.tree.map(blend, flight, memory.added, unknown_scale)
         return guess, max_norm(scaled(guess, inputs))
 
-    weights = jnp.asarray([[3, -3, 1], [1, 0, 0]], start.q.dtype)
-    guesses, errors = jax.vmap(extrapolate)(weights)
-    guess = jax.tree.map(lambda x: x[jnp.argmin(errors)], guesses)
-    x, iterations, result = find_root(
+    smooth, smooth_error = extrapolate(3, -3, 1)
+    last, last_error = extrapolate(1)
+    better = smooth_error <= last_error
+    guess = jax.tree.map(lambda a, b: jnp.where(better, a, b), smooth, last)
+    root = find_root(
         scaled,
         root_finder,
         guess,
@@ -204,16 +215,17 @@ def _solve(
         # What the last steps suggest can lie beyond a fold of the step equations; the
         # flight without force starts on the near side.
         second_guess=jax.tree.map(jnp.divide, flight, unknown_scale),
+        factors=memory.factors,
         skip=skip,
     )
-    z = jax.tree.map(jnp.multiply, x, unknown_scale)
+    z = jax.tree.map(jnp.multiply, root.value, unknown_scale)
     end = scheme.finish(z, problem)
     # What the scheme itself can tell of a failed iterate says more than that it failed.
-    result = first_failure(end.result, from_root_finder(result))
-    memory = jax.tree.map(
-        lambda x, x0, old: jnp.stack([x - x0, old[0], old[1]]), z, flight, memory
+    result = first_failure(end.result, from_root_finder(root.found, root.broken))
+    added = jax.tree.map(
+        lambda x, x0, old: jnp.stack([x - x0, old[0], old[1]]), z, flight, memory.added
     )
-    return end, iterations, result, memory
+    return end, root.iterations, result, Warm(added, root.factors)
 
 
 def _free_flight(

@@ -12,8 +12,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 
+from .._newton import RootFinder
 from .._schemes import AbstractScheme
 from .._system import AbstractSystem, State
 from .._tracing import is_known
@@ -28,10 +28,10 @@ def prepare(
     start: State,
     args: Args,
     h: Real,
-    root_finder: optx.AbstractRootFinder,
+    root_finder: RootFinder,
 ) -> tuple[State, Args, Scalar]:
     """Checked start, `args` of arrays, and `h` in the dtype of the start."""
-    if not isinstance(root_finder, optx.AbstractRootFinder):
+    if not isinstance(root_finder, RootFinder):
         raise TypeError(
             "`root_finder` must be a root finder such as `enerjax.Newton()` or one of "
             f"optimistix, got {root_finder!r}."

@@ -1,5 +1,6 @@
 """Whether the functions of a system fit its state, before anything is evaluated."""
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -17,6 +18,16 @@ from .._system import (
 from .._types import Args
 
 
+_SIGNATURES = dict(
+    potential="`(q, args)`",
+    kinetic="`(v, args)`, or `(q, qdot, args)` of `System.from_lagrangian`,",
+    hamiltonian="`(q, p, args)`",
+    constraint="`(q, args)`",
+    coordinate_constraint="`(q, args)`",
+    kinematics="`(q, args)`",
+)
+
+
 def describe(role: str, fn: Any) -> str:
     name = getattr(fn, "__name__", None)
     return f"`{role}`" if name in (None, role, "<lambda>") else f"`{role}` (`{name}`)"
@@ -24,6 +35,15 @@ def describe(role: str, fn: Any) -> str:
 
 def _shape(role: str, fn: Callable, *inputs: Any) -> tuple[int, ...]:
     """Of the value of a function of the system, which must be a real array."""
+    try:
+        inspect.signature(fn).bind(*inputs)
+    except TypeError as error:
+        raise TypeError(
+            f"{describe(role, fn)} must take {len(inputs)} arguments, {_SIGNATURES[role]} "
+            f"here: {error}."
+        ) from None
+    except ValueError:  # no signature to be had
+        pass
     out = eqx.filter_eval_shape(fn, *inputs)
     if not hasattr(out, "shape") or not jnp.issubdtype(out.dtype, jnp.floating):
         kind = out.dtype if hasattr(out, "dtype") else f"a Python {type(out).__name__}"

@@ -5,7 +5,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._system import AbstractSystem, HamiltonianSystem, State, System
+from .._system import (
+    AbstractSystem,
+    HamiltonianSystem,
+    LagrangianSystem,
+    State,
+    System,
+)
 from .._tracing import is_known
 from .._types import Args
 from .shapes import describe, energies
@@ -57,10 +63,18 @@ def check_values(system: AbstractSystem, state: State, args: Args) -> None:
         return
     functions = {role: describe(role, fn) for role, fn, _ in energies(system, state, args)}
     kinetic = functions.get("kinetic", functions.get("hamiltonian"))
-    inertia = "inertia matrix"
-    if kinetic is not None:
-        inertia = f"inertia (the Hessian of {kinetic})"
     potential = functions.get("potential", kinetic)
+    inertia, missing = "inertia matrix", "A coordinate without mass, or a negative mass?"
+    if isinstance(system, HamiltonianSystem):
+        inertia = f"inverse Hessian of {kinetic} in the momenta"
+        missing = "Is a momentum without energy, or at a singular configuration?"
+    elif kinetic is not None:
+        inertia = f"inertia (the Hessian of {kinetic})"
+    if isinstance(system, LagrangianSystem):
+        missing += " Or are the coordinates singular at the start (polar ones at r = 0)?"
+    elsewhere = " Inertia that varies: `System.from_lagrangian`."
+    if not isinstance(system, System):
+        elsewhere = ""
     for name, message in (
         ("start", f"The start is not finite: q = {state.q}, v = {state.v}."),
         ("args", f"`args` holds a number that is not finite: {args}."),
@@ -71,20 +85,22 @@ def check_values(system: AbstractSystem, state: State, args: Args) -> None:
         ("constraint", "The constraints are not finite at the start. Defined there?"),
         (
             "inertia",
-            f"The {inertia} is not finite. A kinetic energy must have second derivatives "
-            "at `v = 0`: write `v @ v`, not the square of a norm.",
+            f"The {inertia} is not finite. {missing}"
+            if isinstance(system, HamiltonianSystem)
+            else f"The {inertia} is not finite. A kinetic energy must have second "
+            "derivatives at `v = 0`: write `v @ v`, not the square of a norm.",
         ),
         (
             "quadratic",
             f"{kinetic} is not quadratic in the velocities: it must be `1/2 v . M v`, with "
-            "no linear or constant part, and `M` may depend on `q` only for "
-            "`System.from_lagrangian`. Other energies: `System.from_hamiltonian`.",
+            f"no linear or constant part.{elsewhere} Other energies: "
+            "`System.from_hamiltonian`.",
         ),
         ("symmetric", f"The {inertia} is not symmetric."),
         (
             "definite",
-            f"The {inertia} is not positive definite. A coordinate without mass, or a "
-            "negative mass? Every velocity needs some inertia.",
+            f"The {inertia} is not positive definite. {missing} Every velocity needs some "
+            "inertia.",
         ),
     ):
         if not facts[name]:

@@ -128,17 +128,30 @@ def integer_pow(values: list[Value], params: dict[str, Any]) -> list[Value]:
 
 def power(values: list[Value], params: dict[str, Any]) -> list[Value]:
     x, y = values
-    if not moves(y) and jnp.ndim(y) == 0 and is_known(y):
+    if any(isinstance(v, Switching) for v in values):
+        raise NoRule
+    if moves(y):
+        return rewritten(lambda x, y: jnp.exp(y * jnp.log(x)))(values, params)
+    quotient = lambda a, b: elementary.pow(a, b, jnp.asarray(y, a.dtype))
+    if jnp.ndim(y) == 0 and is_known(y):
         twice = 2 * float(y)
         if twice.is_integer() and abs(twice) <= 64:
             n = int(twice)
-            root = lambda x, y: (
-                jax.lax.integer_pow(x, n // 2)
+            quotient = lambda a, b: (
+                elementary.integer_pow(a, b, n // 2)
                 if n % 2 == 0
-                else (jax.lax.integer_pow(jnp.sqrt(x), n))
+                else elementary.half_integer_pow(a, b, n)
             )
-            return rewritten(root)(values, params)
-    return rewritten(lambda x, y: jnp.exp(y * jnp.log(x)))(values, params)
+    ((a, b),) = both(values, params)
+    return [Moving(a, b, quotient(x.a, x.b) * x.d)]
+
+
+def absolute(values: list[Value], params: dict[str, Any]) -> list[Value]:
+    (x,) = values
+    if not jnp.iscomplexobj(at_a(x)):
+        return unary(elementary.absolute)(values, params)
+    size = lambda x: jnp.sqrt(jnp.real(x) ** 2 + jnp.imag(x) ** 2)
+    return rewritten(size)(values, params)
 
 
 def extreme(sign: int) -> Rule:

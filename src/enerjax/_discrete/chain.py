@@ -106,6 +106,9 @@ def _traced(
     if not all(jnp.issubdtype(x.dtype, jnp.floating) for x in flat_a):
         raise TypeError(f"The two points must be real arrays, got {kinds[0]}.")
     program, shape = jax.make_jaxpr(lambda x: fn(x, *args), return_shape=True)(a)
+    kinds = [x.dtype for x in jax.tree.leaves(shape)]
+    if not all(jnp.issubdtype(kind, jnp.floating) for kind in kinds):
+        raise TypeError(f"The function must return real arrays, got {kinds}.")
     out_structure = jax.tree.structure(shape)
 
     def push(d: PyTree[Array], walk: Walk) -> PyTree[Array]:

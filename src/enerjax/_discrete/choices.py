@@ -75,8 +75,12 @@ def select(values: list[Value], params: dict[str, Any]) -> list[Value]:
     mean = sum(increments[1:], increments[0]) / len(cases)
     explained = sum((at_b(v) - at_a(v) for v in cases), jnp.zeros_like(a)) / len(cases)
     same = which.a == which.b
-    rest = jnp.where(same, 0, b - a - explained)
-    shared = mean + share(rest, which.squares, which.decided)
+    # The cases explain the change in part, unless one of them is a dummy that guards a
+    # singularity of the other: then they say nothing of it.
+    rest = b - a - explained
+    helps = jnp.abs(rest) <= jnp.abs(b - a)
+    rest = jnp.where(same, 0, jnp.where(helps, rest, b - a))
+    shared = jnp.where(helps, mean, 0) + share(rest, which.squares, which.decided)
     return [Moving(a, b, jnp.where(same, exact, shared))]
 
 
@@ -95,9 +99,13 @@ def atan2(values: list[Value], params: dict[str, Any]) -> list[Value]:
     dy, dx = map(increment, values)
     cross, dot = xa * yb - ya * xb, xa * xb + ya * yb
     mean_x, mean_y = 0.5 * (xa + xb), 0.5 * (ya + yb)
-    turned = elementary.angle_ratio(cross, dot) * (mean_x * dy - mean_y * dx)
+    # Straight across the origin there is no angle that was turned.
+    across = (cross == 0) & (dot < 0)
+    ratio = elementary.angle_ratio(cross, jnp.where(across, 1, dot))
+    turned = jnp.where(across, 0, ratio * (mean_x * dy - mean_y * dx))
     # Across the branch cut the value jumps by a whole turn that no rotation explains.
     cut = jnp.round((b - a - jnp.arctan2(cross, dot)) / (2 * jnp.pi)) * (2 * jnp.pi)
+    cut = jnp.where(across, b - a, cut)
     squares = ((yb - ya) ** 2 + (xb - xa) ** 2).astype(float)
     decided = ((yb - ya) * dy + (xb - xa) * dx).astype(float)
     return [Moving(a, b, turned + share(cut, squares, decided))]

@@ -64,9 +64,19 @@ def cosh(a: Array, b: Array) -> Array:
 
 
 def tanh(a: Array, b: Array) -> Array:
-    tanh_a, tanh_b = jnp.tanh(a), jnp.tanh(b)
-    slope = 1 - tanh_a * tanh_b
-    return _split(b - a, lambda d: slope * _sinhc(d) / _cosh(d), tanh_b - tanh_a)
+    # Where both values are close to 1, neither may be subtracted from the other.
+    limit = 0.2 * math.log(float(jnp.finfo(a.dtype).max))
+    clipped = lambda x: jnp.clip(x, -limit, limit)
+    near = 1 / (jnp.cosh(clipped(a)) * jnp.cosh(clipped(b)))
+    below_one = lambda x: 2 / (jnp.exp(2 * clipped(x)) + 1)
+    change = jnp.where(
+        (a > 0) & (b > 0),
+        below_one(a) - below_one(b),
+        jnp.where(
+            (a < 0) & (b < 0), below_one(-b) - below_one(-a), jnp.tanh(b) - jnp.tanh(a)
+        ),
+    )
+    return _split(b - a, lambda d: _sinhc(d) * near, change)
 
 
 def logistic(a: Array, b: Array) -> Array:
@@ -109,6 +119,37 @@ def integer_pow(a: Array, b: Array, n: int) -> Array:
     # An empty sum for n = 0.
     terms = [a**k * b ** (n - 1 - k) for k in range(n)]
     return sum(terms, jnp.zeros_like(a))
+
+
+def half_integer_pow(a: Array, b: Array, n: int) -> Array:
+    """Of `sqrt(x)**n` with an odd `n`."""
+    if abs(n) == 1:
+        return sqrt(a, b) if n == 1 else rsqrt(a, b)
+    # The square root itself has no derivative at zero, where this power has.
+    root = lambda x: jnp.where(x == 0, 0, jnp.sqrt(jnp.where(x == 0, 1, x)))
+    root_a, root_b = root(a), root(b)
+    total = root_a + root_b
+    ratio = integer_pow(root_a, root_b, n) / jnp.where(total == 0, 1, total)
+    return jnp.where(total == 0, 0, ratio) if n > 0 else ratio
+
+
+def pow(a: Array, b: Array, exponent: Array) -> Array:
+    """Of `x**exponent`, also of negative numbers where the exponent is whole."""
+    signs = jnp.where(a > 0, 1, 0) * jnp.where(b > 0, 1, 0)
+    mirrored = jnp.where(a < 0, 1, 0) * jnp.where(b < 0, 1, 0)
+    alike = signs + mirrored > 0
+    size_a, size_b = (jnp.where(alike, jnp.abs(x), 1) for x in (a, b))
+    slope = exp(exponent * jnp.log(size_a), exponent * jnp.log(size_b)) * exponent
+    slope = slope * log(size_a, size_b)
+    minus_one = jnp.where(mirrored > 0, -1, 1).astype(a.dtype)
+    slope = jnp.where(mirrored > 0, -(minus_one**exponent) * slope, slope)
+    # From zero or across it nothing cancels, unless both ends are zero.
+    apart = jnp.where(alike | (a == b), 1, b - a)
+    there = lambda x: jnp.where(alike, 1, x) ** exponent
+    at_zero = exponent * jnp.where(alike, 1, a) ** (exponent - 1)
+    return jnp.where(
+        alike, slope, jnp.where(a == b, at_zero, (there(b) - there(a)) / apart)
+    )
 
 
 def atan(a: Array, b: Array) -> Array:
@@ -154,7 +195,7 @@ def smooth(function: Callable[[Array], Array], reach: float) -> Quotient:
 
     def quotient(a: Array, b: Array) -> Array:
         mid, half = 0.5 * (a + b), 0.5 * (b - a)
-        near = jnp.abs(half) < reach
+        near = jnp.abs(half) * (1 + jnp.abs(mid)) < reach
         inner = jnp.where(near, half, 0)
         mean = jnp.zeros_like(a)
         for x, w in zip(nodes.tolist(), weights.tolist(), strict=True):
@@ -179,8 +220,8 @@ def _even(series: Sequence[float]) -> Callable[[Array], Array]:
     return function
 
 
-def _factorials(sign: int, first: int) -> list[float]:
-    return [sign**k / math.factorial(2 * k + first) for k in range(11)]
+def _factorials(sign: int) -> list[float]:
+    return [sign**k / math.factorial(2 * k + 1) for k in range(11)]
 
 
 def _odd_numbers(sign: int) -> list[float]:
@@ -188,9 +229,8 @@ def _odd_numbers(sign: int) -> list[float]:
 
 
 # For |x| < 1.
-_sinc = _even(_factorials(-1, 1))
-_sinhc = _even(_factorials(1, 1))
-_cosh = _even(_factorials(1, 0))
+_sinc = _even(_factorials(-1))
+_sinhc = _even(_factorials(1))
 # For |x| < 1/4.
 _atanc = _even(_odd_numbers(-1))
 _atanhc = _even(_odd_numbers(1))

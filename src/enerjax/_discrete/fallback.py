@@ -6,6 +6,7 @@ the differences `D` of all its moving operands, `change` of the output, and the 
 round-off of the output: there it holds no digit (`corrected.py` states the bound).
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -24,21 +25,32 @@ def fallback(primitive: Any, values: list[Value], params: dict[str, Any]) -> lis
     switching = [v for v in values if isinstance(v, Switching)]
     if not moving:
         return _shared_out(primitive, values, params)
+    if any(jnp.iscomplexobj(values[k].a) for k in moving):
+        raise TypeError(
+            f"The discrete derivative has no rule for `{primitive.name}` of complex "
+            "numbers. Write the function with real numbers: cos and sin, real and "
+            "imaginary parts."
+        )
     start, unravel = ravel_pytree([values[k].a for k in moving])
     end, _ = ravel_pytree([values[k].b for k in moving])
     d, _ = ravel_pytree([values[k].d for k in moving])
-    still = [at_a(v) for v in values]
 
-    def function(flat: Array) -> list[Array]:
-        operands = list(still)
+    def function(flat: Array, at: Callable[[Value], Array] = at_a) -> list[Array]:
+        operands = [at(v) for v in values]
         for k, x in zip(moving, unravel(flat), strict=True):
             operands[k] = x
         return evaluate(primitive, operands, params)
 
     at_end = evaluate(primitive, list(map(at_b, values)), params)
-    at_start = evaluate(primitive, still, params)
+    at_start = evaluate(primitive, list(map(at_a, values)), params)
     # Forward mode: a `while` has no other, and the increments stay linear in `d`.
-    jacobians = [jax.jacfwd(function)(start + c * (end - start)) for c in _GAUSS]
+    # Choices stand as at either end in turn, which keeps the symmetry.
+    choices = (at_a, at_b) if switching else (at_a,)
+    jacobians = [
+        jax.jacfwd(lambda x, at=at: function(x, at))(start + c * (end - start))
+        for c in _GAUSS
+        for at in choices
+    ]
     squares, decided = _totals(switching)
     squares = squares.astype(d.dtype) + jnp.sum((end - start) ** 2)
     decided = decided.astype(d.dtype) + (end - start) @ d
@@ -47,7 +59,7 @@ def fallback(primitive: Any, values: list[Value], params: dict[str, Any]) -> lis
         if not jnp.issubdtype(a.dtype, jnp.inexact):
             outs.append(_choice(a, b, squares, decided))
             continue
-        mean = 0.5 * (jacobians[0][k] + jacobians[1][k])
+        mean = sum(j[k] for j in jacobians) / len(jacobians)
         defect = b - a - mean @ (end - start)
         size = jnp.abs(a) + jnp.abs(b) + jnp.abs(mean) @ (jnp.abs(start) + jnp.abs(end))
         holds_digits = ~(jnp.abs(defect) <= jnp.finfo(a.dtype).eps * size)

@@ -121,6 +121,13 @@ def _column_axis(jaxpr: Any) -> tuple[int, int] | None:
     return contracted[0][0], contracted[1][0]
 
 
+def inverse(values: list[Value], params: dict[str, Any]) -> list[Value]:
+    """`X_b - X_a = -X_b dA X_a`, in both orders: no third inverse."""
+    (matrix,) = values
+    ((a, b),) = both(values, params)
+    return [Moving(a, b, -0.5 * (a @ matrix.d @ b + b @ matrix.d @ a))]
+
+
 def lu(values: list[Value], params: dict[str, Any]) -> list[Value]:
     """`P dA = dL Um + Lm dU`, where both points pivot alike.
 

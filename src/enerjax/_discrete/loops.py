@@ -4,8 +4,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
-from .transform import at_a, at_b, increment, moves, Moving, NoRule, Switching, Value
+from .arithmetic import both
+from .choices import share
+from .transform import at_a, at_b, increment, Moving, NoRule, Switching, Value
 
 
 def scan(values: list[Value], params: dict[str, Any]) -> list[Value]:
@@ -45,11 +48,12 @@ def scan(values: list[Value], params: dict[str, Any]) -> list[Value]:
 
 
 def cond(values: list[Value], params: dict[str, Any]) -> list[Value]:
-    """The rule of the branch that both points take; none where they part."""
+    """The rule of the branch that both points take; the true quotient where they part."""
     walk, branches = params["walk"], params["branches"]
     which, *operands = values
-    if moves(which) or any(isinstance(v, Switching) for v in operands):
+    if any(isinstance(v, Switching) for v in operands):
         raise NoRule
+    inexact = [jnp.issubdtype(x.dtype, jnp.inexact) for x in branches[0].out_avals]
 
     def branch(program):
         def run(operands: list[Value]) -> list[Value]:
@@ -57,12 +61,26 @@ def cond(values: list[Value], params: dict[str, Any]) -> list[Value]:
             if any(isinstance(v, Switching) for v in outs):
                 raise NoRule
             return [
-                Moving(at_a(v), at_b(v), increment(v))
-                if jnp.issubdtype(jnp.result_type(at_a(v)), jnp.inexact)
-                else v
-                for v in outs
+                Moving(at_a(v), at_b(v), increment(v)) if f else v
+                for v, f in zip(outs, inexact, strict=True)
             ]
 
         return run
 
-    return jax.lax.switch(which, [branch(program) for program in branches], operands)
+    runs = [branch(program) for program in branches]
+    if not isinstance(which, Switching):
+        return jax.lax.switch(which, runs, operands)
+    if not all(inexact):
+        raise NoRule
+    ends = both(values, params)
+
+    def together(operands: list[Value]) -> list[Array]:
+        return [out.d for out in jax.lax.switch(which.a, runs, operands)]
+
+    def apart(operands: list[Value]) -> list[Array]:
+        del operands
+        squares, decided = jnp.sum(which.squares), jnp.sum(which.decided)
+        return [share(b - a, squares, decided) for a, b in ends]
+
+    increments = jax.lax.cond(which.a == which.b, together, apart, operands)
+    return [Moving(a, b, d) for (a, b), d in zip(ends, increments, strict=True)]

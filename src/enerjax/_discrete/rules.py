@@ -6,13 +6,13 @@
 | `mul`, `dot_general` | `du mean(v) + mean(u) dv` |
 | `div` | `(du mean(v) - mean(u) dv) / (v_a v_b)` |
 | elementary functions | their quotient in `elementary.py` times the increment |
-| `pow` | of `exp(y log x)`; of `sqrt(x)**n` for a fixed half-integer power |
+| `pow` | of `exp(y log x)`, with its limits at zero; of `sqrt(x)**n` for a fixed half-integer power |
 | `atan2` | angle turned, from the cross and dot products of the two points |
 | `max`, `min`, `clamp`, `reduce_max` | from that of `abs` |
 | `sign`, `floor`, `ceil`, `round` | the true quotient across a step, else zero |
 | comparisons, `select_n`, `cond` | exact where the choice is the same at both points; else the true difference quotient with respect to what decided |
 | `reduce_prod` | telescoping product, in both orders |
-| `cholesky`, `triangular_solve`, `custom_linear_solve`, `lu` | `linalg.py` |
+| `cholesky`, `triangular_solve`, `custom_linear_solve`, `lu`, inverse | `linalg.py` |
 | `scan` | the rule of its body, with the increment in the carry |
 | `jit`, `custom_jvp`, `custom_vjp`, `remat` | of the program inside |
 | all others | `fallback.py` |
@@ -72,7 +72,7 @@ RULES: dict[str, Rule] = {
     "acosh": rewritten(lambda x: jnp.log(x + jnp.sqrt((x - 1) * (x + 1)))),
     "erf": unary(elementary.smooth(jax.scipy.special.erf, 0.4)),
     "erfc": unary(elementary.smooth(jax.scipy.special.erfc, 0.4)),
-    "abs": unary(elementary.absolute),
+    "abs": arithmetic.absolute,
     **dict.fromkeys("sign floor ceil round".split(), choices.piecewise_constant),
     "atan2": choices.atan2,
     "max": arithmetic.extreme(1),
@@ -89,6 +89,7 @@ RULES: dict[str, Rule] = {
     "triangular_solve": linalg.triangular_solve,
     "custom_linear_solve": linalg.linear_solve,
     "lu": linalg.lu,
+    "jit enerjax_inverse": linalg.inverse,
     "scan": loops.scan,
     "cond": loops.cond,
 }

@@ -14,10 +14,11 @@ then dot products, then functions of distances), it inherits the symmetries that
 shows: a discrete gradient of a function of distances exerts no net force and no torque.
 
 **To add a rule:** enter `rule(values, params)` in the table of `rules.py` under the name
-that the primitive has in `jax.make_jaxpr`, made with the helpers of `arithmetic.py`.
-`values` has one entry an operand, plain where the operand is the same at `a` and `b`, else
-a `Moving`; return the same for each output. `params` are those of the primitive, with the
-`primitive` itself and the `walk`.
+that the primitive has in `jax.make_jaxpr`, made with the helpers of `arithmetic.py`. (A
+function under `jax.jit` can have a rule too, as `"jit name"`.) `values` has one entry an
+operand, plain where the operand is the same at `a` and `b`, else a `Moving`; return the
+same for each output. `params` are those of the primitive, with the `primitive` itself and
+the `walk`.
 """
 
 from collections.abc import Callable
@@ -109,6 +110,9 @@ class Walk:
         if not any(moves(value) for value in values):
             return evaluate(primitive, values, params)
         inner = _INNER.get(primitive.name)
+        named = self._rules.get(f"jit {params.get('name')}")
+        if named is not None:
+            return named(values, dict(params, walk=self, primitive=primitive))
         if inner is not None:
             program = params[inner]
             consts = program.consts if isinstance(program, ClosedJaxpr) else []

@@ -139,9 +139,9 @@ class System(AbstractSystem):
 
         **Arguments:**
 
-        - `hamiltonian`: `hamiltonian(q, p, args)`, a scalar (energy), strictly convex in
-          `p`: give redundant momenta an energy too, such as `(q . p)^2 / 2` of a
-          quaternion.
+        - `hamiltonian`: `hamiltonian(q, p, args)`, a scalar (energy) whose Hessian in `p`
+          is positive definite: give redundant momenta an energy too, such as
+          `(q . p)^2 / 2` of a quaternion.
         - `constraint`: as for `from_lagrangian`. It is held in `q`, and
           `B(q) dH/dp = 0` in `p`.
 

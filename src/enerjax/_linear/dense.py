@@ -1,0 +1,165 @@
+"""Inverses of small dense matrices, in plain array operations.
+
+LAPACK calls cost microseconds each for matrices of a few rows, and one such call keeps XLA
+from compiling the loop around it into a single function.
+"""
+
+import abc
+import functools
+from typing import Any, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from .._types import Flag, Scalar
+
+
+# Rows up to which plain operations beat LAPACK.
+SMALL = 32
+# Rows up to which the elimination is written out column by column.
+_UNROLLED = 10
+
+
+@jax.custom_jvp
+def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """The inverse; not finite where the matrix is singular."""
+    return enerjax_inverse(matrix)
+
+
+@inverse.defjvp
+def _inverse_jvp(primals, tangents):
+    # Matrix products alone, however often it is differentiated.
+    (x,), (dx,) = primals, tangents
+    y = inverse(x)
+    return y, -y @ dx @ y
+
+
+@jax.jit
+def enerjax_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """By Gauss-Jordan elimination with row pivoting; rows are chosen, not exchanged.
+
+    The discrete derivative knows it by its name.
+    """
+    if matrix.shape[0] > SMALL:
+        return jnp.linalg.inv(matrix)
+    size = matrix.shape[0]
+    rows = jnp.concatenate([matrix, jnp.eye(size, dtype=matrix.dtype)], axis=1)
+    order = jnp.arange(size)
+
+    def column(k, carry):
+        rows, free, places = carry
+        candidates = jnp.where(free, jnp.abs(rows[:, k]), -1)
+        pivot = jnp.argmax(candidates)
+        chosen = order == pivot
+        row = rows[pivot] / rows[pivot, k]
+        factors = jnp.where(chosen, 0, rows[:, k])
+        rows = jnp.where(chosen[:, None], row[None], rows - factors[:, None] * row[None])
+        return rows, free & ~chosen, jnp.where(order == k, pivot, places)
+
+    carry = rows, jnp.ones((size,), bool), jnp.zeros((size,), order.dtype)
+    if size <= _UNROLLED:
+        carry = functools.reduce(lambda c, k: column(k, c), range(size), carry)
+    else:
+        carry = jax.lax.fori_loop(0, size, column, carry)
+    rows, _, places = carry
+    return rows[places, size:]
+
+
+class AbstractFactors(eqx.Module):
+    """What is kept of a matrix to solve with it, and to begin the next one with."""
+
+    @abc.abstractmethod
+    def renewed(self, matrix: Float[Array, "n n"]) -> Self:
+        """Of another matrix; one that differs little can cost less."""
+
+    @abc.abstractmethod
+    def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Nearly `matrix^-1 right`; not finite where the matrix is singular."""
+
+
+def empty_factors(size: int, dtype: Any) -> AbstractFactors:
+    """Of no matrix yet: the form for its size."""
+    zero = jnp.zeros((size, size), dtype)
+    return Inverse(zero) if size <= SMALL else LU(zero, jnp.arange(size))
+
+
+class Inverse(AbstractFactors):
+    """An approximate inverse, which a chord iteration makes good.
+
+    Renewed by the iteration of G. Schulz (1933), `X (1 + E + E^2 + ...)` with
+    `E = 1 - A X`, which squares the error at each turn; computed afresh where the old one
+    is too far off.
+    """
+
+    inverse: Float[Array, "n n"]
+
+    def renewed(self, matrix: Float[Array, "n n"]) -> "Inverse":
+        defect = jnp.eye(matrix.shape[0], dtype=matrix.dtype) - _product(
+            matrix, self.inverse
+        )
+
+        def is_rough(carry) -> Flag:
+            _, _, size = carry
+            return (size > _ENOUGH) & (size < _FAR)
+
+        def turn(carry):
+            x, e, _ = carry
+            x, e = x + _product(x, e), _product(e, e)
+            return x, e, _row_sum(e)
+
+        def is_lost(carry) -> Flag:
+            _, _, size = carry
+            return ~(size < _FAR)
+
+        def start_again(carry):
+            _, e, _ = carry
+            return inverse(matrix), e, jnp.zeros((), matrix.dtype)
+
+        carry = self.inverse, defect, _row_sum(defect)
+        carry = jax.lax.while_loop(is_rough, turn, carry)
+        return Inverse(jax.lax.while_loop(is_lost, start_again, carry)[0])
+
+    def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
+        return self.inverse @ right
+
+
+class LU(AbstractFactors):
+    """The factors of LAPACK."""
+
+    factors: Float[Array, "n n"]
+    permutation: Int[Array, " n"]
+
+    def renewed(self, matrix: Float[Array, "n n"]) -> "LU":
+        factors, _, permutation = jax.lax.linalg.lu(matrix)
+        return LU(factors, permutation.astype(self.permutation.dtype))
+
+    def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
+        column = right[self.permutation][:, None]
+        column = jax.lax.linalg.triangular_solve(
+            self.factors, column, left_side=True, lower=True, unit_diagonal=True
+        )
+        return jax.lax.linalg.triangular_solve(self.factors, column, left_side=True)[:, 0]
+
+
+def solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Differentiable, and transposable in `right`."""
+    if matrix.shape[0] > SMALL:
+        return jnp.linalg.solve(matrix, right)
+    return inverse(matrix) @ right
+
+
+# Errors of an inverse beyond which it is computed afresh, and which are small enough for a
+# chord iteration to gain as many digits at a time.
+_FAR = 0.5
+_ENOUGH = 1e-5
+
+
+def _product(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n m"]:
+    """A matrix product that XLA fuses with its surroundings, unlike `a @ b`."""
+    return jnp.sum(a[:, :, None] * b[None], axis=1)
+
+
+def _row_sum(matrix: Float[Array, "n n"]) -> Scalar:
+    return jnp.max(jnp.sum(jnp.abs(matrix), axis=1))

@@ -1,0 +1,74 @@
+"""Small products as plain arithmetic, which XLA compiles into the loop around them."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import ClosedJaxpr, Literal
+from jaxtyping import Array, PyTree
+
+from .._discrete import evaluate
+
+
+# Multiplications in a product that is written out.
+_SMALL = 4096
+
+
+def plain_products(
+    fn: Callable[[PyTree[Array]], PyTree[Array]], like: PyTree[Array]
+) -> Callable[[PyTree[Array]], PyTree[Array]]:
+    """`fn` with its small `dot_general`s written as sums of products.
+
+    As a matrix product it would be a call of its own in every pass of a loop, and keep the
+    loop from being compiled into one function; a Jacobian makes such products from every
+    `matrix @ vector`.
+    """
+    program, shape = jax.make_jaxpr(fn, return_shape=True)(like)
+    structure = jax.tree.structure(shape)
+
+    def plain(x: PyTree[Array]) -> PyTree[Array]:
+        outs = _evaluate(program.jaxpr, program.consts, jax.tree.leaves(x))
+        return jax.tree.unflatten(structure, outs)
+
+    return plain
+
+
+def _evaluate(jaxpr: Any, consts: list[Any], inputs: list[Any]) -> list[Any]:
+    known: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
+    known.update(zip(jaxpr.invars, inputs, strict=True))
+
+    def read(atom: Any) -> Any:
+        if isinstance(atom, Literal):
+            return jnp.asarray(atom.val, atom.aval.dtype)  # pyright: ignore
+        return known[atom]
+
+    for equation in jaxpr.eqns:
+        values = [read(atom) for atom in equation.invars]
+        outs = _equation(equation, values)
+        known.update(zip(equation.outvars, outs, strict=True))
+    return [read(atom) for atom in jaxpr.outvars]
+
+
+def _equation(equation: Any, values: list[Any]) -> list[Any]:
+    primitive, params = equation.primitive, equation.params
+    if primitive.name in ("jit", "pjit"):
+        inner: ClosedJaxpr = params["jaxpr"]
+        return _evaluate(inner.jaxpr, inner.consts, values)
+    if primitive.name == "dot_general":
+        left, right = values
+        contracted, batch = params["dimension_numbers"]
+        one = _rows(left, contracted[0], batch[0])
+        other = _rows(right, contracted[1], batch[1])
+        if one.size * other.shape[1] <= _SMALL:
+            out = jnp.sum(one[:, :, None] * other[:, None], axis=-1)
+            return [out.reshape(equation.outvars[0].aval.shape)]
+    return evaluate(primitive, values, params)
+
+
+def _rows(x: Array, contracted: tuple[int, ...], batch: tuple[int, ...]) -> Array:
+    """As (batch, free, contracted)."""
+    free = [k for k in range(x.ndim) if k not in (*contracted, *batch)]
+    sizes = [math.prod(x.shape[k] for k in axes) for axes in (batch, free, contracted)]
+    return jnp.transpose(x, (*batch, *free, *contracted)).reshape(sizes)
