@@ -25,12 +25,6 @@ def fallback(primitive: Any, values: list[Value], params: dict[str, Any]) -> lis
     switching = [v for v in values if isinstance(v, Switching)]
     if not moving:
         return _shared_out(primitive, values, params)
-    if any(jnp.iscomplexobj(values[k].a) for k in moving):
-        raise TypeError(
-            f"The discrete derivative has no rule for `{primitive.name}` of complex "
-            "numbers. Write the function with real numbers: cos and sin, real and "
-            "imaginary parts."
-        )
     start, unravel = ravel_pytree([values[k].a for k in moving])
     end, _ = ravel_pytree([values[k].b for k in moving])
     d, _ = ravel_pytree([values[k].d for k in moving])
@@ -43,6 +37,12 @@ def fallback(primitive: Any, values: list[Value], params: dict[str, Any]) -> lis
 
     at_end = evaluate(primitive, list(map(at_b, values)), params)
     at_start = evaluate(primitive, list(map(at_a, values)), params)
+    if any(map(jnp.iscomplexobj, [*at_start, *(values[k].a for k in moving)])):
+        raise TypeError(
+            f"The discrete derivative has no rule for `{primitive.name}` of complex "
+            "numbers. Write the function with real numbers: cos and sin, real and "
+            "imaginary parts."
+        )
     # Forward mode: a `while` has no other, and the increments stay linear in `d`.
     # Choices stand as at either end in turn, which keeps the symmetry.
     choices = (at_a, at_b) if switching else (at_a,)

@@ -26,7 +26,7 @@ from .arithmetic import linear, rewritten, unary
 from .transform import Rule
 
 
-_STRUCTURAL = "concatenate stack pad".split()
+_STRUCTURAL = "concatenate stack pad complex conj".split()
 _ONE_OPERAND = (
     "reshape broadcast_in_dim transpose squeeze expand_dims slice rev reduce_sum cumsum "
     "copy real imag split reduce_precision sharding_constraint"
