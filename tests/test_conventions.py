@@ -18,7 +18,8 @@ TESTS = sorted(pathlib.Path(__file__).parent.glob("*.py"))
 
 # Each imports only from lower layers: from what stands further up.
 LAYERS = [
-    {"_types", "_results", "_tracing"},
+    {"_types", "_tracing", "_fast_loops"},
+    {"_results"},
     {"_discrete"},
     {"_linear"},
     {"_kinematics", "_newton"},

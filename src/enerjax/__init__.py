@@ -12,6 +12,7 @@ from ._discrete import (
     Gonzalez as Gonzalez,
     MeanValue as MeanValue,
 )
+from ._fast_loops import enable_fast_loops as enable_fast_loops
 from ._initial import (
     consistent_start as consistent_start,
     ConsistentStart as ConsistentStart,

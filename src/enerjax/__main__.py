@@ -12,6 +12,8 @@ from pathlib import Path
 
 import jax
 
+from ._fast_loops import enable_fast_loops
+
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
@@ -71,4 +73,6 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
+    # Of this process alone: who calls `main` decides for theirs.
+    enable_fast_loops()
     main()
