@@ -4,7 +4,7 @@
 
 Each row is a run, whose error is measured first; a wrong answer is reported and not timed.
 Times are medians over interleaved repeats, on one core (the process pins itself), with
-XLA's default settings and with `enable_fast_loops()` (two processes). The double pendulum is
+XLA's default settings and with `enable_fast_loops()` (two processes). The pendulum is
 released from the horizontal, two unit rods and masses; the top is `problems.heavy_top`.
 EXUDYN (the extra `peers`) runs the generalized-alpha method, rho 0.9, in the same Cartesian
 coordinates. Writes step_cost.json and step_cost.png.

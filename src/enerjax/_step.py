@@ -34,10 +34,13 @@ class Warm(eqx.Module):
     Pass it from one `step` to the next, with the same `h`, to start Newton closer.
 
     - `added`: what the last three steps added to a free flight, newest first.
+    - `is_smooth`: whether extrapolating from these would have met the last step better
+      than repeating.
     - `factors`: of the Jacobian of the last step.
     """
 
     added: PyTree[Any]
+    is_smooth: Flag
     factors: AbstractFactors
 
 
@@ -78,7 +81,7 @@ def first_warm(
         flight = _free_flight(scheme.stage, problem, model, start)
         added = jax.tree.map(lambda x, x0: jnp.stack([x - x0] * 3), z, flight)
         flat, _ = ravel_pytree(flight)
-        return Warm(added, empty_factors(flat.size, flat.dtype))
+        return Warm(added, jnp.array(True), empty_factors(flat.size, flat.dtype))
 
     lengths = jnp.asarray(scheme.stages, h.dtype)
     return jax.vmap(predict)(lengths)
@@ -193,19 +196,12 @@ def _solve(
     inputs = (scheme, problem, unknown_scale, row_scale)
 
     # Smooth motion is met by extrapolation; where it changes quickly the last step is
-    # the better guess. Two residuals are cheap beside one Jacobian. (One after the other:
-    # together they would make matrix products, see `plain_products`.)
-    def extrapolate(*weights):
-        blend = lambda x0, x, unit: (
-            (x0 + sum(w * x[k] for k, w in enumerate(weights))) / unit
-        )
-        guess = jax.tree.map(blend, flight, memory.added, unknown_scale)
-        return guess, max_norm(scaled(guess, inputs))
-
-    smooth, smooth_error = extrapolate(3, -3, 1)
-    last, last_error = extrapolate(1)
-    better = smooth_error <= last_error
-    guess = jax.tree.map(lambda a, b: jnp.where(better, a, b), smooth, last)
+    # the better guess. What would have been better for the step before decides.
+    smooth = jax.tree.map(lambda x: 3 * x[0] - 3 * x[1] + x[2], memory.added)
+    last = jax.tree.map(lambda x: x[0], memory.added)
+    choose = lambda x, y: jnp.where(memory.is_smooth, x, y)
+    added = jax.tree.map(choose, smooth, last)
+    guess = jax.tree.map(lambda x0, x, s: (x0 + x) / s, flight, added, unknown_scale)
     root = find_root(
         scaled,
         root_finder,
@@ -222,10 +218,18 @@ def _solve(
     end = scheme.finish(z, problem)
     # What the scheme itself can tell of a failed iterate says more than that it failed.
     result = first_failure(end.result, from_root_finder(root.found, root.broken))
-    added = jax.tree.map(
-        lambda x, x0, old: jnp.stack([x - x0, old[0], old[1]]), z, flight, memory.added
+    added = jax.lax.stop_gradient(jax.tree.map(jnp.subtract, z, flight))
+    off = lambda x: max_norm(
+        jax.tree.map(lambda x, y, unit: (x - y) / unit, added, x, unknown_scale)
     )
-    return end, root.iterations, result, Warm(added, root.factors)
+    memory = Warm(
+        jax.tree.map(
+            lambda new, old: jnp.stack([new, old[0], old[1]]), added, memory.added
+        ),
+        off(smooth) <= off(last),
+        root.factors,
+    )
+    return end, root.iterations, result, memory
 
 
 def _free_flight(
