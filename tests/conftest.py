@@ -12,3 +12,10 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 def is_type_checked(request):
     """Whether the annotations of the package are enforced in this run."""
     return bool(request.config.getoption("--jaxtyping-packages", None))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forget_programs():
+    """A process can map only so many compiled programs into its memory."""
+    yield
+    jax.clear_caches()

@@ -183,3 +183,18 @@ def test_a_failed_lane_leaves_the_gradients_of_the_others_finite():
     assert np.all(np.isfinite(slope[np.array([0, 2])]))
     alone, _ = jax.jit(jax.grad(fn, has_aux=True))(steps[0])
     np.testing.assert_allclose(slope[0], alone, rtol=1e-10)
+
+
+def test_numbers_that_the_functions_close_over_count():
+    def tip(g):
+        rod = lambda q, args: jnp.array([q @ q - 1.0])
+        system = ej.System(jnp.eye(2), lambda q, args: -g * q[1], rod)
+        start = ej.initial_state(system, [1.0, 0.0], [0.0, 0.0])
+        run = ej.simulate(system, ej.EnergyPreserving(), start, h=0.01, num_steps=20)
+        return run.ys.q[-1, 0]
+
+    value = jax.jit(tip)
+    difference = (value(9.81 + 1e-5) - value(9.81 - 1e-5)) / 2e-5
+    forward, reverse = jax.jit(jax.jacfwd(tip))(9.81), jax.jit(jax.grad(tip))(9.81)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-10)  # solver
+    np.testing.assert_allclose(reverse, difference, rtol=1e-6)  # of the difference

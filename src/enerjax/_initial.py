@@ -139,19 +139,21 @@ def _project_position(model: AbstractModel, state: State) -> tuple[Coordinates, 
 
     def conditions(x, inputs):
         """The nearest point: `metric (q - guess) + B^T mu = 0`, `Phi(q) = 0`."""
-        model, metric, guess = inputs
+        model, metric, guess, size = inputs
+        scales = model.scales
         shift, mu = size * x[0] / scales.coordinate, size * x[1] / scales.constraint
         constraint, pull = jax.vjp(model.constraint, guess + shift)
         force = metric @ shift + pull(mu)[0]
         rows = size * scales.constraint + scales.constraint_size
         return force / (size * scales.coordinate), constraint / rows
 
+    inputs = (model, metric, guess, size)
     zero = (jnp.zeros_like(guess), jnp.zeros_like(scales.constraint))
     tolerance = 1e2 * jnp.finfo(guess.dtype).eps
-    root = find_root(conditions, Newton(), zero, (model, metric, guess), max_iterations=50)
+    root = find_root(conditions, Newton(), zero, inputs, max_iterations=50)
     x, found = root.value, root.found
     # Constraints that are met are not far; whether they are independent is told apart.
-    met = jnp.max(jnp.abs(conditions(zero, (model, metric, guess))[1])) <= tolerance
+    met = jnp.max(jnp.abs(conditions(zero, inputs)[1])) <= tolerance
     near = met | (found & _linear(model, metric, guess))
     q = jnp.where(met & ~found, guess, guess + size * x[0] / scales.coordinate)
     return q, near

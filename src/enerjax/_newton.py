@@ -185,7 +185,8 @@ def _search(
         steps = solution.stats["num_steps"]
         return Root(solution.value, start.factors, steps, found, singular | nonfinite)
     flat, unravel = ravel_pytree(start.guess)
-    residual = plain_products(lambda x: ravel_pytree(fn(unravel(x), args))[0], flat)
+    flat_fn = lambda x, args: ravel_pytree(fn(unravel(x), args))[0]
+    residual = plain_products(flat_fn, flat, args)
     last = _newton(residual, root_finder, start, max_iterations)
     return Root(unravel(last.x), last.factors, last.corrections, last.done, last.broken)
 
@@ -205,11 +206,10 @@ def _root_jvp(primals, tangents):
     fixed, moved = eqx.partition(args, unmoved, is_leaf=is_none)
     flat, unravel = ravel_pytree(root.value)
 
-    def residual(x, moved):
-        return ravel_pytree(fn(unravel(x), eqx.combine(moved, fixed)))[0]
-
-    _, rate = jax.jvp(lambda moved: residual(flat, moved), (moved,), (t_args,))
-    jacobian = jax.jacfwd(plain_products(lambda x: residual(x, moved), flat))(flat)
+    flat_fn = lambda x, args: ravel_pytree(fn(unravel(x), args))[0]
+    by_args = lambda moved: flat_fn(flat, eqx.combine(moved, fixed))
+    _, rate = jax.jvp(by_args, (moved,), (t_args,))
+    jacobian = jax.jacfwd(plain_products(flat_fn, flat, args))(flat)
     # Nothing but the root itself depends on the arguments: not how it was found.
     still = jax.tree.map(jnp.zeros_like, eqx.filter(root, eqx.is_inexact_array))
     t_value = unravel(-solve(jacobian, rate))
@@ -229,6 +229,7 @@ def find_root(
 ) -> Root:
     """The root of `fn(y, args)`. Never raises.
 
+
     The implicit function theorem gives its derivatives with respect to `args`, with one
     linear solve each; a singular lane of a batch has non-finite derivatives of its own and
     leaves the others alone. `guess`, `factors` (of a solve before) and `second_guess` only
@@ -242,4 +243,13 @@ def find_root(
         jnp.asarray(skip),
     )
     start = jax.lax.stop_gradient(start)
-    return _root(fn, root_finder, args, start, max_iterations)
+    # What is closed over becomes an input: functions in `args` may hold traced numbers.
+    # (The lambda has a closure, without which the conversion would not look for any.)
+    closed = lambda y, args: fn(y, args)
+    converted = eqx.filter_closure_convert(closed, guess, args)
+    return _root(_call, root_finder, (converted, args), start, max_iterations)
+
+
+def _call(y: PyTree[Array], inputs: PyTree) -> PyTree[Array]:
+    fn, args = inputs
+    return fn(y, args)

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Literal
@@ -17,22 +18,22 @@ _SMALL = 4096
 
 
 def plain_products(
-    fn: Callable[[PyTree[Array]], PyTree[Array]], like: PyTree[Array]
-) -> Callable[[PyTree[Array]], PyTree[Array]]:
-    """`fn` with its small `dot_general`s written as sums of products.
+    fn: Callable[[Array, PyTree], Array], like: Array, args: PyTree
+) -> Callable[[Array], Array]:
+    """`fn(x, args)` as a function of `x`, with small `dot_general`s as sums of products.
 
     As a matrix product it would be a call of its own in every pass of a loop, and keep the
     loop from being compiled into one function; a Jacobian makes such products from every
-    `matrix @ vector`.
+    `matrix @ vector`. What `fn` depends on must be in `args`, not closed over.
     """
-    program, shape = jax.make_jaxpr(fn, return_shape=True)(like)
-    structure = jax.tree.structure(shape)
+    arrays, static = eqx.partition(args, eqx.is_array)
+    leaves, structure = jax.tree.flatten(arrays)
 
-    def plain(x: PyTree[Array]) -> PyTree[Array]:
-        outs = _evaluate(program.jaxpr, program.consts, jax.tree.leaves(x))
-        return jax.tree.unflatten(structure, outs)
+    def flat_fn(x: Array, *leaves: Array) -> Array:
+        return fn(x, eqx.combine(jax.tree.unflatten(structure, leaves), static))
 
-    return plain
+    program = jax.make_jaxpr(flat_fn)(like, *leaves)
+    return lambda x: _evaluate(program.jaxpr, program.consts, [x, *leaves])[0]
 
 
 def _evaluate(jaxpr: Any, consts: list[Any], inputs: list[Any]) -> list[Any]:
