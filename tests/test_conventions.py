@@ -23,6 +23,7 @@ LAYERS = [
     {"_discrete"},
     {"_linear"},
     {"_kinematics", "_newton"},
+    {"_root"},
     {"_system"},
     {"_model"},
     {"_audit"},
@@ -95,14 +96,15 @@ def test_the_imports_are_seen():
 
 
 def test_newton_knows_no_mechanics():
-    ours = {module for module in all_imports("_newton") if module.startswith("enerjax")}
-    assert ours <= {"enerjax._types", "enerjax._linear"}
+    for name in ("_newton", "_root"):
+        ours = {module for module in all_imports(name) if module.startswith("enerjax")}
+        assert ours <= {"enerjax._types", "enerjax._linear", "enerjax._newton"}
 
 
 def test_schemes_know_no_solver():
     for module in all_imports("_schemes"):
         assert module.split(".")[0] not in ("optimistix", "lineax")
-        assert module != "enerjax._newton"
+        assert module not in ("enerjax._newton", "enerjax._root")
 
 
 def test_the_run_knows_no_scheme_by_name():

@@ -160,7 +160,8 @@ def test_more_alpha_dissipates_more(name, scheme):
 def test_newton_needs_few_iterations(name, scheme, alpha):
     iterations = run(name, scheme, alpha).stats.newton_iterations
     assert iterations.min() >= 1
-    assert iterations.max() <= 4
+    # Corrections; most share their Jacobian with the one before.
+    assert iterations.max() <= 6
     assert iterations.mean() <= 3
 
 

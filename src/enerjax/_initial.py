@@ -9,7 +9,8 @@ from jaxtyping import Array, Float
 
 from ._check import check_system
 from ._model import AbstractModel, make_model
-from ._newton import find_root, Newton
+from ._newton import Newton
+from ._root import find_root
 from ._system import AbstractSystem, HamiltonianSystem, State
 from ._tracing import is_known
 from ._types import Args, Coordinates, Count, Flag, Multipliers, Vector, Velocities

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 from ._audit import audit
 from ._check import positive_integer, prepare
 from ._model import AbstractModel, make_model
-from ._newton import Newton, RootFinder
+from ._newton import Newton
 from ._results import first_failure, RESULTS
+from ._root import RootFinder
 from ._schemes import AbstractScheme
 from ._solution import Solution, Statistics
 from ._step import advance, first_warm, Warm

@@ -16,8 +16,9 @@ from jaxtyping import PyTree
 from ._check import prepare
 from ._linear import AbstractFactors, empty_factors
 from ._model import AbstractModel, make_model
-from ._newton import find_root, max_norm, Newton, RootFinder
+from ._newton import max_norm, Newton
 from ._results import first_failure, from_root_finder, RESULTS
+from ._root import find_root, RootFinder
 from ._scaling import scales_like
 from ._schemes import AbstractScheme, AbstractSingleSolve
 from ._system import AbstractSystem, State

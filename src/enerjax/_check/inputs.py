@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._newton import RootFinder
+from .._root import RootFinder
 from .._schemes import AbstractScheme
 from .._system import AbstractSystem, State
 from .._tracing import is_known

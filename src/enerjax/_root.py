@@ -1,0 +1,128 @@
+"""The one nonlinear driver: every step equation of the package is solved here.
+
+It knows no mechanics. It takes a function whose arguments and values are scaled to
+order one, and finds its root, by default with `Newton`. Derivatives of the root follow
+from the implicit function theorem, in forward and in reverse mode.
+"""
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, PyTree
+
+from ._linear import AbstractFactors, empty_factors, plain_products, solve
+from ._newton import Newton, newton_iterations, Start
+from ._types import Count, Flag
+
+
+RootFinder: TypeAlias = Newton | optx.AbstractRootFinder
+
+
+class Root(eqx.Module):
+    """A root, or the last iterate where none was found.
+
+    - `value`: the unknowns.
+    - `factors`: for the next solve.
+    - `iterations`: corrections made.
+    - `found`: whether they converged.
+    - `broken`: whether they became singular or non-finite.
+    """
+
+    value: PyTree[Array]
+    factors: AbstractFactors
+    iterations: Count
+    found: Flag
+    broken: Flag
+
+
+def _search(
+    fn: Callable[[PyTree[Array], Any], PyTree[Array]],
+    root_finder: RootFinder,
+    args: PyTree,
+    start: Start,
+    max_iterations: int,
+) -> Root:
+    if not isinstance(root_finder, Newton):
+        solution = optx.root_find(
+            fn, root_finder, start.guess, args, max_steps=max_iterations, throw=False
+        )
+        found, singular, nonfinite = (
+            solution.result == getattr(optx.RESULTS, name)
+            for name in ("successful", "singular", "nonfinite")
+        )
+        steps = solution.stats["num_steps"]
+        return Root(solution.value, start.factors, steps, found, singular | nonfinite)
+    flat, unravel = ravel_pytree(start.guess)
+    flat_fn = lambda x, args: ravel_pytree(fn(unravel(x), args))[0]
+    residual = plain_products(flat_fn, flat, args)
+    last = newton_iterations(residual, root_finder, start, max_iterations)
+    return Root(unravel(last.x), last.factors, last.corrections, last.done, last.broken)
+
+
+@eqx.filter_custom_jvp
+def _root(fn, root_finder, args, start, max_iterations):
+    return _search(fn, root_finder, args, start, max_iterations)
+
+
+@_root.def_jvp
+def _root_jvp(primals, tangents):
+    fn, root_finder, args, start, max_iterations = primals
+    t_args = tangents[2]
+    root = _root(fn, root_finder, args, start, max_iterations)
+    is_none = lambda x: x is None
+    unmoved = jax.tree.map(is_none, t_args, is_leaf=is_none)
+    fixed, moved = eqx.partition(args, unmoved, is_leaf=is_none)
+    flat, unravel = ravel_pytree(root.value)
+
+    flat_fn = lambda x, args: ravel_pytree(fn(unravel(x), args))[0]
+    by_args = lambda moved: flat_fn(flat, eqx.combine(moved, fixed))
+    _, rate = jax.jvp(by_args, (moved,), (t_args,))
+    jacobian = jax.jacfwd(plain_products(flat_fn, flat, args))(flat)
+    # Nothing but the root itself depends on the arguments: not how it was found.
+    still = jax.tree.map(jnp.zeros_like, eqx.filter(root, eqx.is_inexact_array))
+    t_value = unravel(-solve(jacobian, rate))
+    return root, eqx.tree_at(lambda root: root.value, still, t_value)
+
+
+def find_root(
+    fn: Callable[[PyTree[Array], Any], PyTree[Array]],
+    root_finder: RootFinder,
+    guess: PyTree[Array],
+    args: PyTree,
+    *,
+    max_iterations: int,
+    second_guess: PyTree[Array] | None = None,
+    factors: AbstractFactors | None = None,
+    skip: Flag | bool = False,
+) -> Root:
+    """The root of `fn(y, args)`. Never raises.
+
+
+    The implicit function theorem gives its derivatives with respect to `args`, with one
+    linear solve each; a singular lane of a batch has non-finite derivatives of its own and
+    leaves the others alone. `guess`, `factors` (of a solve before) and `second_guess` only
+    say where to begin. With `skip`, `Newton` returns the guess without an iteration.
+    """
+    flat, _ = ravel_pytree(guess)
+    start = Start(
+        guess,
+        guess if second_guess is None else second_guess,
+        empty_factors(flat.size, flat.dtype) if factors is None else factors,
+        jnp.asarray(skip),
+    )
+    start = jax.lax.stop_gradient(start)
+    # What is closed over becomes an input: functions in `args` may hold traced numbers.
+    # (The lambda has a closure, without which the conversion would not look for any.)
+    closed = lambda y, args: fn(y, args)
+    converted = eqx.filter_closure_convert(closed, guess, args)
+    return _root(_call, root_finder, (converted, args), start, max_iterations)
+
+
+def _call(y: PyTree[Array], inputs: PyTree) -> PyTree[Array]:
+    fn, args = inputs
+    return fn(y, args)
