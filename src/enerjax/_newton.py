@@ -25,7 +25,7 @@ class Newton(eqx.Module):
     than three. Stops after a correction whose error, predicted from their linear
     convergence to be `c_k (c_k / c_{k-1})`, is of round-off size, or which was computed
     from a residual that is. An iteration that breaks down, or has not converged with
-    twelve Jacobians, begins again from a second guess.
+    25 Jacobians, begins again from a second guess.
 
     **Arguments:**
 
@@ -64,7 +64,7 @@ class _Iterate(eqx.Module):
 
 # Jacobians after which a first guess is given up. Where quadratic convergence sets in at
 # all, it does so before.
-_PATIENCE = 12
+_PATIENCE = 25
 # Corrections with one Jacobian.
 _CORRECTIONS = 8
 
