@@ -104,10 +104,9 @@ def test_energy_consistent_never_gains_energy_where_the_potential_is_concave(nam
     audit = solution.audit
     scale = np.max(audit.kinetic) + np.max(audit.potential)
     assert np.all(audit.dissipated >= 0)
-    # Solver: the last correction leaves a few times its own round-off.
-    assert np.max(np.diff(audit.energy)) <= 50 * EPS * scale
+    assert np.max(np.diff(audit.energy)) <= 20 * EPS * scale
     leak = np.diff(audit.energy) + audit.dissipated[1:]
-    assert np.max(np.abs(leak)) <= 50 * EPS * scale
+    assert np.max(np.abs(leak)) <= 20 * EPS * scale
 
 
 def test_energy_decaying_gains_energy_there_and_says_so():

@@ -128,7 +128,7 @@ def test_tops_keep_energy_and_what_their_coordinates_show(name):
     position = TOPS[name][1](run.ys.q[-1])
     error = np.max(np.abs(position - HEAVY_TOP[0.2].position))
     assert error <= TOPS[name][2]  # truncation
-    assert _drift(run.audit.energy) <= 1e-13  # solver, 200 steps
+    assert _drift(run.audit.energy) <= 2e-14  # round-off, a random walk of 200 steps
     # The spin about the axis of figure, and with Euler parameters the vertical momentum,
     # are kept to second order: a mean of rotations is no rotation.
     assert _drift(spin) <= 0.3 * _drift(coarse_spin)
@@ -136,7 +136,7 @@ def test_tops_keep_energy_and_what_their_coordinates_show(name):
         assert _drift(vertical) <= 0.3 * _drift(coarse_vertical)
         assert _drift(vertical) <= 2e-3
     else:
-        assert _drift(vertical) <= 1e-13
+        assert _drift(vertical) <= 2e-14
 
 
 @pytest.mark.slow

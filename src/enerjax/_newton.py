@@ -21,11 +21,12 @@ class Newton(eqx.Module):
     """Newton's method on a problem scaled to order one, down to round-off.
 
     One Jacobian serves several corrections, with an approximate inverse that is improved
-    from that of the step before. It is renewed where the corrections `c_k` shrink by less
-    than three. Stops after a correction whose error, predicted from their linear
-    convergence to be `c_k (c_k / c_{k-1})`, is of round-off size, or which was computed
-    from a residual that is. An iteration that breaks down, or has not converged with
-    25 Jacobians, begins again from a second guess.
+    from that of the step before. It is renewed where the corrections `c_k` would shrink by
+    less than three; such a correction is not made. Stops after a correction whose error,
+    predicted to be `c_k max(c_k / c_{k-1}, c_{k-1})`, is of round-off size, or which was
+    computed from a residual that is, or where corrections that did shrink no longer do:
+    coordinates far from the origin are too coarse for more. An iteration that breaks
+    down, or has not converged with 12 Jacobians, begins again from a second guess.
 
     **Arguments:**
 
@@ -64,9 +65,9 @@ class _Iterate(eqx.Module):
 
 # Jacobians after which a first guess is given up. Where quadratic convergence sets in at
 # all, it does so before.
-_PATIENCE = 25
-# Corrections with one Jacobian.
-_CORRECTIONS = 8
+_PATIENCE = 12
+# What a correction may leave of the one before, for its Jacobian to serve on.
+_SHRINKS = 0.3
 
 
 def newton_iterations(
@@ -80,47 +81,56 @@ def newton_iterations(
         value = residual(x)
         return value, value
 
-    def corrected(carry: _Iterate, value: Array) -> tuple[_Iterate, Scalar, Flag]:
-        """One correction, its contraction, and whether the residual was round-off."""
+    def corrected(carry: _Iterate, value: Array) -> tuple[_Iterate, Scalar]:
+        """One correction, and what it leaves of the one before."""
         correction = carry.factors.solve(value)
         x = carry.x - correction
         # Each unknown against itself: one scale for all would hide a light, slow body
         # beside a heavy, fast one. The floor is for unknowns that pass through zero.
         size = jnp.max(jnp.abs(correction) / (jnp.abs(x) + eps**0.125), initial=0.0)
-        small = (max_norm(value) <= newton.atol * eps) & (size <= eps**0.25)
-        contraction = size / carry.size
-        carry = eqx.tree_at(
-            lambda c: (c.x, c.size, c.corrections), carry, (x, size, carry.corrections + 1)
+        done = (max_norm(value) <= newton.atol * eps) & (size <= eps**0.25)
+        after = _Iterate(
+            x,
+            carry.factors,
+            size,
+            carry.corrections + 1,
+            carry.jacobians,
+            done,
+            carry.broken,
         )
-        return carry, contraction, small
+        return after, size / carry.size
 
-    def converging(inner: tuple[_Iterate, Flag]) -> Flag:
-        carry, slow = inner
-        return ~carry.done & ~slow
+    def converging(inner: tuple[_Iterate, Scalar]) -> Flag:
+        carry, contraction = inner
+        return ~carry.done & (contraction < _SHRINKS)
 
-    def chord(inner: tuple[_Iterate, Flag]) -> tuple[_Iterate, Flag]:
-        before = inner[0]
-        carry, contraction, small = corrected(before, residual(before.x))
-        # The contraction of a chord is what its Jacobian is off by: it stays.
-        done = small | (
-            (contraction < 0.3) & (carry.size * contraction <= newton.rtol * eps)
-        )
-        slow = ~(contraction < 0.3)
-        return eqx.tree_at(lambda c: c.done, carry, done), slow
+    def chord(inner: tuple[_Iterate, Scalar]) -> tuple[_Iterate, Scalar]:
+        before, _ = inner
+        value = residual(before.x)
+        after, contraction = corrected(before, value)
+        # The contraction of a chord is what its Jacobian is off by: it stays. At least as
+        # much as the last correction moved it, where one that shrinks more is an accident.
+        shrinks = contraction < _SHRINKS
+        left = after.size * jnp.maximum(contraction, before.size)
+        converged = shrinks & (left <= newton.rtol * eps)
+        after = eqx.tree_at(lambda c: c.done, after, after.done | converged)
+        kept = shrinks | after.done
+        return jax.tree.map(lambda x, y: jnp.where(kept, x, y), after, before), contraction
 
     def linearise(carry: _Iterate) -> _Iterate:
         jacobian, value = jax.jacfwd(with_value, has_aux=True)(carry.x)
-        last, factors = carry.size, carry.factors.renewed(jacobian)
         carry = eqx.tree_at(
-            lambda c: (c.factors, c.jacobians), carry, (factors, carry.jacobians + 1)
+            lambda c: (c.factors, c.jacobians),
+            carry,
+            (carry.factors.renewed(jacobian), carry.jacobians + 1),
         )
-        carry, contraction, small = corrected(carry, value)
-        # With a Jacobian of its own, a correction that does not shrink is round-off:
-        # coordinates far from the origin are too coarse for the rates to settle further.
-        done = small | ((last <= eps**0.25) & (contraction > 0.6))
-        done = done & jnp.isfinite(carry.size)
-        carry = eqx.tree_at(lambda c: c.done, carry, done)
-        carry, _ = jax.lax.while_loop(converging, chord, (carry, ~jnp.isfinite(carry.size)))
+        carry, contraction = corrected(carry, value)
+        # With a Jacobian of its own a small correction shrinks, unless it is round-off.
+        stalled = (max_norm(value) <= eps**0.75) & (carry.size <= eps**0.25)
+        done = carry.done | (stalled & (contraction >= _SHRINKS))
+        carry = eqx.tree_at(lambda c: c.done, carry, done & jnp.isfinite(carry.size))
+        begin = jnp.where(jnp.isfinite(carry.size), 0.0, jnp.inf).astype(x0.dtype)
+        carry, _ = jax.lax.while_loop(converging, chord, (carry, begin))
         broken = ~jnp.isfinite(carry.size)
         lost = broken | (carry.jacobians == _PATIENCE)
         again = lost & ~carry.done & (carry.jacobians <= _PATIENCE)

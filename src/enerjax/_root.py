@@ -102,7 +102,6 @@ def find_root(
 ) -> Root:
     """The root of `fn(y, args)`. Never raises.
 
-
     The implicit function theorem gives its derivatives with respect to `args`, with one
     linear solve each; a singular lane of a batch has non-finite derivatives of its own and
     leaves the others alone. `guess`, `factors` (of a solve before) and `second_guess` only
