@@ -40,6 +40,12 @@ class Root(eqx.Module):
     broken: Flag
 
 
+def _flattened(fn: Callable, value: PyTree[Array]) -> tuple[Array, Callable, Callable]:
+    """A value as a vector, its inverse, and `fn` between vectors."""
+    flat, unravel = ravel_pytree(value)
+    return flat, unravel, lambda x, args: ravel_pytree(fn(unravel(x), args))[0]
+
+
 def _search(
     fn: Callable[[PyTree[Array], Any], PyTree[Array]],
     root_finder: RootFinder,
@@ -57,8 +63,7 @@ def _search(
         )
         steps = solution.stats["num_steps"]
         return Root(solution.value, start.factors, steps, found, singular | nonfinite)
-    flat, unravel = ravel_pytree(start.guess)
-    flat_fn = lambda x, args: ravel_pytree(fn(unravel(x), args))[0]
+    flat, unravel, flat_fn = _flattened(fn, start.guess)
     residual = plain_products(flat_fn, flat, args)
     last = newton_iterations(residual, root_finder, start, max_iterations)
     return Root(unravel(last.x), last.factors, last.corrections, last.done, last.broken)
@@ -77,9 +82,7 @@ def _root_jvp(primals, tangents):
     is_none = lambda x: x is None
     unmoved = jax.tree.map(is_none, t_args, is_leaf=is_none)
     fixed, moved = eqx.partition(args, unmoved, is_leaf=is_none)
-    flat, unravel = ravel_pytree(root.value)
-
-    flat_fn = lambda x, args: ravel_pytree(fn(unravel(x), args))[0]
+    flat, unravel, flat_fn = _flattened(fn, root.value)
     by_args = lambda moved: flat_fn(flat, eqx.combine(moved, fixed))
     _, rate = jax.jvp(by_args, (moved,), (t_args,))
     jacobian = jax.jacfwd(plain_products(flat_fn, flat, args))(flat)

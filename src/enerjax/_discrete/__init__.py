@@ -7,4 +7,3 @@ from .chain import (
     discrete_jvp as discrete_jvp,
 )
 from .corrected import Gonzalez as Gonzalez, MeanValue as MeanValue
-from .transform import evaluate as evaluate

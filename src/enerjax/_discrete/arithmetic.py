@@ -9,12 +9,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._tracing import is_known
+from .._tracing import evaluate, is_known
 from . import elementary
 from .transform import (
     at_a,
     at_b,
-    evaluate,
     increment,
     moves,
     Moving,

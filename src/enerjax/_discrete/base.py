@@ -2,6 +2,8 @@ import abc
 from collections.abc import Callable
 
 import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
 
 from .._types import Coordinates, Scalar
 
@@ -32,3 +34,11 @@ class AbstractDerivative(eqx.Module):
         `weights` are what squares of the increments are weighted with in the norm of a
         correction: they matter where the entries have different units.
         """
+
+
+def significant(defect: Array, size: Array) -> Array:
+    """`defect`, or zero where it is the round-off of a difference of numbers of `size`.
+
+    Not a number stays what it is: it must show in the step.
+    """
+    return jnp.where(jnp.abs(defect) <= jnp.finfo(defect.dtype).eps * size, 0, defect)

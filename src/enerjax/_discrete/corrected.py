@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._types import Coordinates, Scalar
-from .base import AbstractDerivative
+from .base import AbstractDerivative, significant
 
 
 def _corrected(
@@ -40,12 +40,11 @@ def _corrected(
     fn_a, fn_b = fn(a), fn(b)
     defect = fn_b - fn_a - mean @ d
     size = abs(fn_a) + abs(fn_b) + abs(mean) @ (abs(a) + abs(b))
-    # So written, a value that is not a number holds: it must show in the step.
-    holds_digits = ~(abs(defect) <= jnp.finfo(a.dtype).eps * size)
+    defect = significant(defect, size)
     # Both operands of the quotient are guarded: under autodiff the branch that `where`
     # does not take is multiplied by zero, and must be finite for that.
-    length2 = jnp.where(holds_digits, d @ along, 1.0)
-    return mean + jnp.where(holds_digits, defect, 0.0) / length2 * along
+    length2 = jnp.where(defect != 0, d @ along, 1.0)
+    return mean + defect / length2 * along
 
 
 class Gonzalez(AbstractDerivative):

@@ -14,7 +14,10 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from .transform import at_a, at_b, evaluate, Moving, Switching, Value
+from .._tracing import evaluate
+from .base import significant
+from .choices import share
+from .transform import at_a, at_b, Moving, Switching, Value
 
 
 _GAUSS = (0.5 - 12**-0.5, 0.5 + 12**-0.5)
@@ -62,9 +65,8 @@ def fallback(primitive: Any, values: list[Value], params: dict[str, Any]) -> lis
         mean = sum(j[k] for j in jacobians) / len(jacobians)
         defect = b - a - mean @ (end - start)
         size = jnp.abs(a) + jnp.abs(b) + jnp.abs(mean) @ (jnp.abs(start) + jnp.abs(end))
-        holds_digits = ~(jnp.abs(defect) <= jnp.finfo(a.dtype).eps * size)
-        share = jnp.where(holds_digits, defect, 0) / jnp.where(squares > 0, squares, 1)
-        outs.append(Moving(a, b, mean @ d + share * decided))
+        rest = share(significant(defect, size), squares, decided)
+        outs.append(Moving(a, b, mean @ d + rest))
     return outs
 
 
@@ -77,8 +79,7 @@ def _shared_out(primitive: Any, values: list[Value], params: dict[str, Any]) -> 
         if not jnp.issubdtype(a.dtype, jnp.inexact):
             outs.append(_choice(a, b, squares, decided))
             continue
-        weight = (b - a) / jnp.where(squares > 0, squares, 1).astype(a.dtype)
-        outs.append(Moving(a, b, weight * decided.astype(a.dtype)))
+        outs.append(Moving(a, b, share(b - a, squares, decided)))
     return outs
 
 

@@ -25,8 +25,10 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
 import jax.numpy as jnp
-from jax.extend.core import ClosedJaxpr, Literal
+from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array
+
+from .._tracing import evaluate, interpret
 
 
 class Moving(NamedTuple):
@@ -88,22 +90,8 @@ class Walk:
 
     def open(self, jaxpr: Any, consts: list[Value], inputs: list[Value]) -> list[Value]:
         """The outputs of a program for inputs that may move."""
-        known: dict[Any, Value] = {}
-
-        def read(atom: Any) -> Value:
-            if isinstance(atom, Literal):
-                return jnp.asarray(atom.val, atom.aval.dtype)  # pyright: ignore
-            return known[atom]
-
         constants = [c if moves(c) else jnp.asarray(c) for c in consts]
-        known.update(zip(jaxpr.constvars, constants, strict=True))
-        known.update(zip(jaxpr.invars, inputs, strict=True))
-        for equation in jaxpr.eqns:
-            values = [read(atom) for atom in equation.invars]
-            known.update(
-                zip(equation.outvars, self._equation(equation, values), strict=True)
-            )
-        return [read(atom) for atom in jaxpr.outvars]
+        return interpret(jaxpr, constants, inputs, self._equation)
 
     def _equation(self, equation: Any, values: list[Value]) -> list[Value]:
         primitive, params = equation.primitive, equation.params
@@ -139,12 +127,3 @@ _INNER = {
     "checkpoint": "jaxpr",
     "remat2": "jaxpr",
 }
-
-
-def evaluate(primitive: Any, values: list[Any], params: dict[str, Any]) -> list[Any]:
-    """The outputs of a primitive, as a list."""
-    bound = primitive.get_bind_params(params)
-    # A pair before JAX 0.10, the parameters alone since.
-    functions, params = bound if isinstance(bound, tuple) else ((), bound)
-    out = primitive.bind(*functions, *values, **params)
-    return list(out) if primitive.multiple_results else [out]

@@ -7,10 +7,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.extend.core import ClosedJaxpr, Literal
+from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array, PyTree
 
-from .._discrete import evaluate
+from .._tracing import evaluate, interpret
 
 
 # Multiplications in a product that is written out.
@@ -33,30 +33,14 @@ def plain_products(
         return fn(x, eqx.combine(jax.tree.unflatten(structure, leaves), static))
 
     program = jax.make_jaxpr(flat_fn)(like, *leaves)
-    return lambda x: _evaluate(program.jaxpr, program.consts, [x, *leaves])[0]
-
-
-def _evaluate(jaxpr: Any, consts: list[Any], inputs: list[Any]) -> list[Any]:
-    known: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
-    known.update(zip(jaxpr.invars, inputs, strict=True))
-
-    def read(atom: Any) -> Any:
-        if isinstance(atom, Literal):
-            return jnp.asarray(atom.val, atom.aval.dtype)  # pyright: ignore
-        return known[atom]
-
-    for equation in jaxpr.eqns:
-        values = [read(atom) for atom in equation.invars]
-        outs = _equation(equation, values)
-        known.update(zip(equation.outvars, outs, strict=True))
-    return [read(atom) for atom in jaxpr.outvars]
+    return lambda x: interpret(program.jaxpr, program.consts, [x, *leaves], _equation)[0]
 
 
 def _equation(equation: Any, values: list[Any]) -> list[Any]:
     primitive, params = equation.primitive, equation.params
     if primitive.name in ("jit", "pjit"):
         inner: ClosedJaxpr = params["jaxpr"]
-        return _evaluate(inner.jaxpr, inner.consts, values)
+        return interpret(inner.jaxpr, inner.consts, values, _equation)
     if primitive.name == "dot_general":
         left, right = values
         contracted, batch = params["dimension_numbers"]
