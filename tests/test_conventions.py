@@ -29,6 +29,7 @@ LAYERS = [
     {"_audit"},
     {"_schemes", "_scaling", "_solution"},
     {"_check"},
+    {"_solve"},
     {"_step", "_initial"},
     {"_simulate", "problems"},
     {"_report"},

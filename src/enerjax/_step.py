@@ -1,8 +1,6 @@
-"""One step: predict, solve, finish; or a chain of such solves.
+"""One step: a solve, or a chain of solves.
 
-This is the layer where solves are counted, and where the physics scales what Newton
-sees: rates by the inertia, multipliers by the gradients of their constraints, and
-everything by an energy of the step.
+This is the layer where solves are counted.
 """
 
 from typing import Any
@@ -10,39 +8,32 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from ._check import prepare
-from ._linear import AbstractFactors, empty_factors
 from ._model import AbstractModel, make_model
-from ._newton import max_norm, Newton
-from ._results import first_failure, from_root_finder, RESULTS
-from ._root import find_root, RootFinder
-from ._scaling import scales_like
-from ._schemes import AbstractScheme, AbstractSingleSolve
+from ._newton import Newton
+from ._results import RESULTS
+from ._root import RootFinder
+from ._schemes import AbstractScheme
+from ._solve import first_memory, Memory, solve
 from ._system import AbstractSystem, State
-from ._types import Args, Count, Flag, Multipliers, Real, Scalar, Velocities
-
-
-# Enough for the linear convergence of a locking step; a step that needs more has failed.
-MAX_ITERATIONS = 50
+from ._types import Args, Coordinates, Count, Flag, Multipliers, Real, Scalar, Velocities
 
 
 class Warm(eqx.Module):
-    """What the last steps leave for the next, for each stage.
+    """What the last steps leave for the next.
 
     Pass it from one `step` to the next, with the same `h`, to start Newton closer.
 
-    - `added`: what the last three steps added to a free flight, newest first.
-    - `is_smooth`: whether extrapolating from these would have met the last step better
-      than repeating.
-    - `factors`: of the Jacobian of the last step.
+    - `stages`: for each stage, stacked.
+    - `rest`: what the rounding of `q` has withheld from it so far, less than its last
+      digit. Added to the next displacement, it does not accumulate: bodies far from the
+      origin keep the energy as well as others.
     """
 
-    added: PyTree[Any]
-    is_smooth: Flag
-    factors: AbstractFactors
+    stages: Memory
+    rest: Coordinates
 
 
 class StepOutput(eqx.Module):
@@ -76,16 +67,13 @@ def first_warm(
 ) -> Warm:
     """The memory of a run that begins: every stage predicted from the start."""
 
-    def predict(length):
-        problem = scheme.stage.problem(model, start, length * h)
-        z = scheme.stage.predict(problem, acceleration, multipliers)
-        flight = _free_flight(scheme.stage, problem, model, start)
-        added = jax.tree.map(lambda x, x0: jnp.stack([x - x0] * 3), z, flight)
-        flat, _ = ravel_pytree(flight)
-        return Warm(added, jnp.array(True), empty_factors(flat.size, flat.dtype))
+    def first(length):
+        return first_memory(
+            scheme.stage, model, start, length * h, acceleration, multipliers
+        )
 
     lengths = jnp.asarray(scheme.stages, h.dtype)
-    return jax.vmap(predict)(lengths)
+    return Warm(jax.vmap(first)(lengths), jnp.zeros_like(start.q))
 
 
 def advance(
@@ -99,16 +87,19 @@ def advance(
 ) -> StepOutput:
     """One step of a scheme, without checks. With `skip` it costs no iteration."""
 
-    def stage(state, stage_input):
+    def stage(carry, stage_input):
+        state, rest = carry
         length, memory = stage_input
-        end, iterations, result, memory = _solve(
+        end, iterations, result, memory = solve(
             scheme.stage, model, state, length * h, memory, root_finder, skip
         )
         reported = (end.multipliers, end.dissipated, end.details, iterations, result)
-        return end.state, (length, reported, memory)
+        q, rest = _sum_and_rest(state.q, end.displacement + rest)
+        return (State(q, end.state.v), rest), (length, reported, memory)
 
     lengths = jnp.asarray(scheme.stages, h.dtype)
-    state, (lengths, reported, memory) = jax.lax.scan(stage, start, (lengths, warm))
+    begin, inputs = (start, warm.rest), (lengths, warm.stages)
+    (state, rest), (lengths, reported, memory) = jax.lax.scan(stage, begin, inputs)
     multipliers, dissipated, details, iterations, results = reported
     return StepOutput(
         state,
@@ -118,8 +109,16 @@ def advance(
         jax.tree.map(lambda x: x[-1], details),
         jnp.sum(iterations),
         _first_of(results),
-        memory,
+        Warm(memory, rest),
     )
+
+
+def _sum_and_rest(x: Array, y: Array) -> tuple[Array, Array]:
+    """The rounded sum and what the rounding took, exactly (D. E. Knuth's two-sum)."""
+    total = x + y
+    of_y = total - x
+    rest = (x - (total - of_y)) + (y - of_y)
+    return total, jax.lax.stop_gradient(rest)
 
 
 @eqx.filter_jit
@@ -174,72 +173,6 @@ def step(
     """
     state, args, h = prepare(system, scheme, state, args, h, root_finder)
     return _single_step(system, scheme, state, args, h, warm, root_finder)
-
-
-def _solve(
-    scheme: AbstractSingleSolve,
-    model: AbstractModel,
-    start: State,
-    h: Scalar,
-    memory: Warm,
-    root_finder: RootFinder,
-    skip: Flag,
-):
-    problem = scheme.problem(model, start, h)
-    flight = _free_flight(scheme, problem, model, start)
-    unknown_scale, row_scale = scales_like(flight, model, start, h)
-
-    def scaled(x, inputs):
-        scheme, problem, unknown_scale, row_scale = inputs
-        z = jax.tree.map(jnp.multiply, x, unknown_scale)
-        return jax.tree.map(jnp.divide, scheme.residual(z, problem), row_scale)
-
-    inputs = (scheme, problem, unknown_scale, row_scale)
-
-    # Smooth motion is met by extrapolation; where it changes quickly the last step is
-    # the better guess. What would have been better for the step before decides.
-    smooth = jax.tree.map(lambda x: 3 * x[0] - 3 * x[1] + x[2], memory.added)
-    last = jax.tree.map(lambda x: x[0], memory.added)
-    choose = lambda x, y: jnp.where(memory.is_smooth, x, y)
-    added = jax.tree.map(choose, smooth, last)
-    guess = jax.tree.map(lambda x0, x, s: (x0 + x) / s, flight, added, unknown_scale)
-    root = find_root(
-        scaled,
-        root_finder,
-        guess,
-        inputs,
-        max_iterations=MAX_ITERATIONS,
-        # What the last steps suggest can lie beyond a fold of the step equations; the
-        # flight without force starts on the near side.
-        second_guess=jax.tree.map(jnp.divide, flight, unknown_scale),
-        factors=memory.factors,
-        skip=skip,
-    )
-    z = jax.tree.map(jnp.multiply, root.value, unknown_scale)
-    end = scheme.finish(z, problem)
-    # What the scheme itself can tell of a failed iterate says more than that it failed.
-    result = first_failure(end.result, from_root_finder(root.found, root.broken))
-    added = jax.lax.stop_gradient(jax.tree.map(jnp.subtract, z, flight))
-    off = lambda x: max_norm(
-        jax.tree.map(lambda x, y, unit: (x - y) / unit, added, x, unknown_scale)
-    )
-    memory = Warm(
-        jax.tree.map(
-            lambda new, old: jnp.stack([new, old[0], old[1]]), added, memory.added
-        ),
-        off(smooth) <= off(last),
-        root.factors,
-    )
-    return end, root.iterations, result, memory
-
-
-def _free_flight(
-    scheme: AbstractSingleSolve, problem: Any, model: AbstractModel, start: State
-) -> PyTree[Any]:
-    """The unknowns of a step in which no force acts."""
-    num_constraints = jax.eval_shape(model.constraint, start.q).shape[0]
-    no_force = jnp.zeros((num_constraints,), start.q.dtype)
-    return scheme.predict(problem, jnp.zeros_like(start.v), no_force)
 
 
 def _first_of(results: RESULTS) -> RESULTS:

@@ -80,6 +80,7 @@ class StepEnd(eqx.Module):
     """What a solved step yields.
 
     - `state`: at the end of the step.
+    - `displacement`: of the configuration over the step, not yet rounded to that of `q`.
     - `multipliers`: `lambda` of the step, joints first (energy per constraint unit).
     - `dissipated`: the energy that the scheme removed, by its own identity.
     - `details`: what the scheme reports of its own, or `None`.
@@ -87,6 +88,7 @@ class StepEnd(eqx.Module):
     """
 
     state: State
+    displacement: Coordinates
     multipliers: Multipliers
     dissipated: Scalar
     details: PyTree[Any]

@@ -154,7 +154,9 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
         dv = self._velocity(problem, end.v - step.start.v)
         jump_q = -h / 6 * (dv - alpha * jump_v)
         size = jump_q @ problem.stiffness @ jump_q + jump_v @ problem.inertia @ jump_v
-        return StepEnd(end, z.impulse / h, 0.5 * alpha * size, None, RESULTS.successful)
+        return StepEnd(
+            end, h * z.rate, z.impulse / h, 0.5 * alpha * size, None, RESULTS.successful
+        )
 
     def _alpha(self, h: Scalar) -> Scalar:
         return self.alpha.astype(h.dtype)

@@ -111,6 +111,7 @@ class EnergyDecaying(AbstractSingleSolve[JumpAndEnd, StepProblem]):
         kinetic, potential = jump_energy(problem, jump)
         return StepEnd(
             end,
+            problem.h * z.end.rate,
             z.end.impulse / problem.h,
             self.alpha.astype(kinetic.dtype) * (kinetic + potential),
             None,

@@ -69,6 +69,7 @@ class EnergyPreserving(AbstractSingleSolve[Increment, StepProblem]):
     def finish(self, z: Increment, problem: StepProblem) -> StepEnd:
         return StepEnd(
             self._end(z, problem),
+            problem.h * z.rate,
             z.impulse / problem.h,
             jnp.zeros_like(problem.h),
             None,

@@ -117,6 +117,7 @@ class KappaDecaying(AbstractSingleSolve[_Unknowns, StepProblem]):
         bounded = ((kappa > 0) & (kappa < 2)) | ~jnp.isfinite(kappa)
         return StepEnd(
             end,
+            problem.h * z.nodes.end.rate,
             z.nodes.end.impulse / problem.h,
             self.alpha.astype(kappa.dtype) * (kappa * kinetic + potential),
             kappa,

@@ -1,0 +1,124 @@
+"""One solve of the step equations: predict, find the root, finish.
+
+Here the physics scales what Newton sees: rates by the inertia, multipliers by the
+gradients of their constraints, and everything by an energy of the step.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import PyTree
+
+from ._linear import AbstractFactors, empty_factors
+from ._model import AbstractModel
+from ._newton import max_norm
+from ._results import first_failure, from_root_finder
+from ._root import find_root, RootFinder
+from ._scaling import scales_like
+from ._schemes import AbstractSingleSolve
+from ._system import State
+from ._types import Flag, Multipliers, Scalar, Velocities
+
+
+# Enough for the linear convergence of a locking step; a step that needs more has failed.
+MAX_ITERATIONS = 50
+
+
+class Memory(eqx.Module):
+    """What the last steps leave for a solve.
+
+    - `added`: what the last three steps added to a free flight, newest first.
+    - `is_smooth`: whether extrapolating from these would have met the last step better
+      than repeating.
+    - `factors`: of the Jacobian of the last step.
+    """
+
+    added: PyTree[Any]
+    is_smooth: Flag
+    factors: AbstractFactors
+
+
+def first_memory(
+    scheme: AbstractSingleSolve,
+    model: AbstractModel,
+    start: State,
+    h: Scalar,
+    acceleration: Velocities,
+    multipliers: Multipliers,
+) -> Memory:
+    """The memory of a run that begins."""
+    problem = scheme.problem(model, start, h)
+    z = scheme.predict(problem, acceleration, multipliers)
+    flight = _free_flight(scheme, problem, model, start)
+    added = jax.tree.map(lambda x, x0: jnp.stack([x - x0] * 3), z, flight)
+    flat, _ = ravel_pytree(flight)
+    return Memory(added, jnp.array(True), empty_factors(flat.size, flat.dtype))
+
+
+def solve(
+    scheme: AbstractSingleSolve,
+    model: AbstractModel,
+    start: State,
+    h: Scalar,
+    memory: Memory,
+    root_finder: RootFinder,
+    skip: Flag,
+):
+    problem = scheme.problem(model, start, h)
+    flight = _free_flight(scheme, problem, model, start)
+    unknown_scale, row_scale = scales_like(flight, model, start, h)
+
+    def scaled(x, inputs):
+        scheme, problem, unknown_scale, row_scale = inputs
+        z = jax.tree.map(jnp.multiply, x, unknown_scale)
+        return jax.tree.map(jnp.divide, scheme.residual(z, problem), row_scale)
+
+    inputs = (scheme, problem, unknown_scale, row_scale)
+
+    # Smooth motion is met by extrapolation; where it changes quickly the last step is
+    # the better guess. What would have been better for the step before decides.
+    smooth = jax.tree.map(lambda x: 3 * x[0] - 3 * x[1] + x[2], memory.added)
+    last = jax.tree.map(lambda x: x[0], memory.added)
+    choose = lambda x, y: jnp.where(memory.is_smooth, x, y)
+    added = jax.tree.map(choose, smooth, last)
+    guess = jax.tree.map(lambda x0, x, s: (x0 + x) / s, flight, added, unknown_scale)
+    root = find_root(
+        scaled,
+        root_finder,
+        guess,
+        inputs,
+        max_iterations=MAX_ITERATIONS,
+        # What the last steps suggest can lie beyond a fold of the step equations; the
+        # flight without force starts on the near side.
+        second_guess=jax.tree.map(jnp.divide, flight, unknown_scale),
+        factors=memory.factors,
+        skip=skip,
+    )
+    z = jax.tree.map(jnp.multiply, root.value, unknown_scale)
+    end = scheme.finish(z, problem)
+    # What the scheme itself can tell of a failed iterate says more than that it failed.
+    result = first_failure(end.result, from_root_finder(root.found, root.broken))
+    added = jax.lax.stop_gradient(jax.tree.map(jnp.subtract, z, flight))
+    off = lambda x: max_norm(
+        jax.tree.map(lambda x, y, unit: (x - y) / unit, added, x, unknown_scale)
+    )
+    memory = Memory(
+        jax.tree.map(
+            lambda new, old: jnp.stack([new, old[0], old[1]]), added, memory.added
+        ),
+        off(smooth) <= off(last),
+        root.factors,
+    )
+    return end, root.iterations, result, memory
+
+
+def _free_flight(
+    scheme: AbstractSingleSolve, problem: Any, model: AbstractModel, start: State
+) -> PyTree[Any]:
+    """The unknowns of a step in which no force acts."""
+    num_constraints = jax.eval_shape(model.constraint, start.q).shape[0]
+    no_force = jnp.zeros((num_constraints,), start.q.dtype)
+    return scheme.predict(problem, jnp.zeros_like(start.v), no_force)
