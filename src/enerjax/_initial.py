@@ -8,12 +8,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._check import check_system
+from ._linear import affine_root, Symmetric
 from ._model import AbstractModel, make_model
 from ._newton import Newton
 from ._root import find_root
 from ._system import AbstractSystem, HamiltonianSystem, State
 from ._tracing import is_known
 from ._types import Args, Coordinates, Count, Flag, Multipliers, Vector, Velocities
+
+
+# Coordinates from which the rank of the constraints is not counted.
+_LARGE = 500
 
 
 class ConsistentStart(eqx.Module):
@@ -123,10 +128,31 @@ def _project(
         model.joint_rate(q, given.v),
         model.joint_rate(q, state.v),
     )
-    jacobian = jax.lax.stop_gradient(model.constraint_jacobian(q))
-    unit = jacobian / model.scales.coordinate[None, :] / model.scales.constraint[:, None]
-    rank = jnp.linalg.matrix_rank(unit) if unit.size > 0 else jnp.array(0)
-    return start, near, rank
+    return start, near, jax.lax.stop_gradient(_rank(model, q))
+
+
+def _rank(model: AbstractModel, q: Coordinates) -> Count:
+    """The rank of the Jacobian of the constraints; of a large one, full or less."""
+    scales = model.scales
+    num_constraints = scales.constraint.size
+    if num_constraints == 0:
+        return jnp.array(0)
+    if q.size <= _LARGE:
+        jacobian = jax.jacfwd(model.constraint)(q)
+        unit = jacobian / scales.coordinate[None, :] / scales.constraint[:, None]
+        return jnp.linalg.matrix_rank(unit)
+    # A vector is found again from its product with `B B^T` only if that is regular.
+    _, transpose = jax.vjp(model.constraint, q)
+
+    def product(mu: Multipliers) -> Multipliers:
+        motion = transpose(mu / scales.constraint)[0] / scales.coordinate**2
+        return jax.jvp(model.constraint, (q,), (motion,))[1] / scales.constraint
+
+    probe = jnp.cos(jnp.arange(num_constraints, dtype=q.dtype))
+    image = product(probe)
+    again = affine_root(lambda mu: product(mu) - image, probe)
+    found = jnp.max(jnp.abs(again - probe)) <= jnp.finfo(q.dtype).eps ** 0.25
+    return num_constraints - 1 + found.astype(int)
 
 
 def _project_position(model: AbstractModel, state: State) -> tuple[Coordinates, Flag]:
@@ -160,18 +186,27 @@ def _project_position(model: AbstractModel, state: State) -> tuple[Coordinates, 
     return q, near
 
 
-def _linear(model: AbstractModel, metric: Float[Array, "nq nq"], q: Coordinates) -> Flag:
+def _linear(model: AbstractModel, metric: Symmetric, q: Coordinates) -> Flag:
     """Whether the linearised constraints explain the error at `q`.
 
     The natural monotonicity test of P. Deuflhard, Newton Methods for Nonlinear Problems
     (2004): a simplified second correction shorter than a fifth of the first. (From
     infinitely far from a sphere it is a quarter.)
     """
-    jacobian = model.constraint_jacobian(q)
-    flexible = jnp.linalg.solve(metric, jacobian.T)
+    scales = model.scales
+    _, transpose = jax.vjp(model.constraint, q)
 
-    def correction(residual):
-        return flexible @ jnp.linalg.solve(jacobian @ flexible, residual)
+    def correction(residual: Multipliers) -> Coordinates:
+        """The shortest with this effect on the constraints."""
+
+        def conditions(x: Array) -> Array:
+            shift, mu = x[: q.size] / scales.coordinate, x[q.size :] / scales.constraint
+            change = jax.jvp(model.constraint, (q,), (shift,))[1] - residual
+            force = metric @ shift + transpose(mu)[0]
+            return jnp.concatenate([force / scales.coordinate, change / scales.constraint])
+
+        x = affine_root(conditions, jnp.zeros((q.size + residual.size,), q.dtype))
+        return x[: q.size] / scales.coordinate
 
     first = correction(model.constraint(q))
     second = correction(model.constraint(q - first))
@@ -186,10 +221,12 @@ def _project_velocity(model: AbstractModel, state: State) -> Velocities:
         return v
 
     def correct(v: Velocities, _) -> tuple[Velocities, None]:
-        jacobian = jax.jacfwd(model.joint_rate, argnums=1)(q, v)
-        flexible = model.mobility(State(q, v)) @ jacobian.T
-        rate = model.joint_rate(q, v)
-        return v - flexible @ jnp.linalg.solve(jacobian @ flexible, rate), None
+        mobility, rates = model.mobility(State(q, v)), lambda v: model.joint_rate(q, v)
+        rate, transpose = jax.vjp(rates, v)
+        unit = model.scales.constraint[: rate.size]
+        change = lambda mu: mobility @ transpose(mu / unit)[0]
+        remaining = lambda mu: (rate - jax.jvp(rates, (v,), (change(mu),))[1]) / unit
+        return v - change(affine_root(remaining, rate)), None
 
     # Exact at once where the energy is a quadratic form of the momenta; else Newton.
     corrections = 8 if isinstance(model.system, HamiltonianSystem) else 1

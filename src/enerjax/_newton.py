@@ -1,14 +1,12 @@
 """Newton's method, on functions whose arguments and values are scaled to order one."""
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from ._linear import AbstractFactors
+from ._linear import AbstractFactors, Linearisable
 from ._types import Count, Flag, Scalar
 
 
@@ -42,13 +40,13 @@ class Start(eqx.Module):
     """Where a solve begins.
 
     - `guess`, `second_guess`: first values of the unknowns.
-    - `factors`: of the Jacobian of the solve before, or empty.
+    - `factors`: of the Jacobian of the solve before, where it is kept.
     - `skip`: return the guess without an iteration.
     """
 
     guess: PyTree[Array]
     second_guess: PyTree[Array]
-    factors: AbstractFactors
+    factors: AbstractFactors | None
     skip: Flag
 
 
@@ -71,15 +69,11 @@ _SHRINKS = 0.3
 
 
 def newton_iterations(
-    residual: Callable[[Array], Array], newton: Newton, start: Start, max_jacobians: int
+    residual: Linearisable, newton: Newton, start: Start, max_jacobians: int
 ) -> _Iterate:
     x0, _ = ravel_pytree(start.guess)
     second, _ = ravel_pytree(start.second_guess)
     eps = float(jnp.finfo(x0.dtype).eps)
-
-    def with_value(x):
-        value = residual(x)
-        return value, value
 
     def corrected(carry: _Iterate, value: Array) -> tuple[_Iterate, Scalar]:
         """One correction, and what it leaves of the one before."""
@@ -106,7 +100,7 @@ def newton_iterations(
 
     def chord(inner: tuple[_Iterate, Scalar]) -> tuple[_Iterate, Scalar]:
         before, _ = inner
-        value = residual(before.x)
+        value = residual.value(before.x)
         after, contraction = corrected(before, value)
         # The contraction of a chord is what its Jacobian is off by: it stays. At least as
         # much as the last correction moved it, where one that shrinks more is an accident.
@@ -118,7 +112,7 @@ def newton_iterations(
         return jax.tree.map(lambda x, y: jnp.where(kept, x, y), after, before), contraction
 
     def linearise(carry: _Iterate) -> _Iterate:
-        jacobian, value = jax.jacfwd(with_value, has_aux=True)(carry.x)
+        jacobian, value = residual.jacobian(carry.x)
         carry = eqx.tree_at(
             lambda c: (c.factors, c.jacobians),
             carry,
@@ -146,6 +140,7 @@ def newton_iterations(
         )
 
     infinite, none, no = jnp.asarray(jnp.inf, x0.dtype), jnp.array(0), jnp.array(False)
-    first = _Iterate(x0, start.factors, infinite, none, none, start.skip, no)
+    factors = residual.no_factors(start.factors, x0)
+    first = _Iterate(x0, factors, infinite, none, none, start.skip, no)
     unfinished = lambda c: ~(c.done | c.broken) & (c.jacobians < max_jacobians)
     return jax.lax.while_loop(unfinished, linearise, first)

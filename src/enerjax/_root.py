@@ -15,7 +15,8 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from ._linear import AbstractFactors, empty_factors, plain_products, solve
+from ._linear import AbstractFactors, kept_factors, linearisable
+from ._tracing import is_known
 from ._newton import Newton, newton_iterations, Start
 from ._types import Count, Flag
 
@@ -34,7 +35,7 @@ class Root(eqx.Module):
     """
 
     value: PyTree[Array]
-    factors: AbstractFactors
+    factors: AbstractFactors | None
     iterations: Count
     found: Flag
     broken: Flag
@@ -64,9 +65,10 @@ def _search(
         steps = solution.stats["num_steps"]
         return Root(solution.value, start.factors, steps, found, singular | nonfinite)
     flat, unravel, flat_fn = _flattened(fn, start.guess)
-    residual = plain_products(flat_fn, flat, args)
+    residual = linearisable(flat_fn, flat, args)
     last = newton_iterations(residual, root_finder, start, max_iterations)
-    return Root(unravel(last.x), last.factors, last.corrections, last.done, last.broken)
+    factors = None if start.factors is None else last.factors
+    return Root(unravel(last.x), factors, last.corrections, last.done, last.broken)
 
 
 @eqx.filter_custom_jvp
@@ -85,11 +87,10 @@ def _root_jvp(primals, tangents):
     flat, unravel, flat_fn = _flattened(fn, root.value)
     by_args = lambda moved: flat_fn(flat, eqx.combine(moved, fixed))
     _, rate = jax.jvp(by_args, (moved,), (t_args,))
-    jacobian = jax.jacfwd(plain_products(flat_fn, flat, args))(flat)
+    change = linearisable(flat_fn, flat, args).solve(flat, -rate)
     # Nothing but the root itself depends on the arguments: not how it was found.
     still = jax.tree.map(jnp.zeros_like, eqx.filter(root, eqx.is_inexact_array))
-    t_value = unravel(-solve(jacobian, rate))
-    return root, eqx.tree_at(lambda root: root.value, still, t_value)
+    return root, eqx.tree_at(lambda root: root.value, still, unravel(change))
 
 
 def find_root(
@@ -114,7 +115,7 @@ def find_root(
     start = Start(
         guess,
         guess if second_guess is None else second_guess,
-        empty_factors(flat.size, flat.dtype) if factors is None else factors,
+        kept_factors(flat.size, flat.dtype) if factors is None else factors,
         jnp.asarray(skip),
     )
     start = jax.lax.stop_gradient(start)
@@ -122,9 +123,7 @@ def find_root(
     # (The lambda has a closure, without which the conversion would not look for any.)
     closed = lambda y, args: fn(y, args)
     converted = eqx.filter_closure_convert(closed, guess, args)
-    return _root(_call, root_finder, (converted, args), start, max_iterations)
-
-
-def _call(y: PyTree[Array], inputs: PyTree) -> PyTree[Array]:
-    fn, args = inputs
-    return fn(y, args)
+    # What is known stays closed over: indices tell which unknowns a row depends on.
+    traced, known = eqx.partition(converted, lambda x: not is_known(x))
+    call = lambda y, inputs: eqx.combine(inputs[0], known)(y, inputs[1])
+    return _root(call, root_finder, (traced, args), start, max_iterations)

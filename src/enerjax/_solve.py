@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
-from ._linear import AbstractFactors, empty_factors
+from ._linear import AbstractFactors, kept_factors
 from ._model import AbstractModel
 from ._newton import max_norm
 from ._results import first_failure, from_root_finder
@@ -38,7 +38,7 @@ class Memory(eqx.Module):
 
     added: PyTree[Any]
     is_smooth: Flag
-    factors: AbstractFactors
+    factors: AbstractFactors | None
 
 
 def first_memory(
@@ -55,7 +55,7 @@ def first_memory(
     flight = _free_flight(scheme, problem, model, start)
     added = jax.tree.map(lambda x, x0: jnp.stack([x - x0] * 3), z, flight)
     flat, _ = ravel_pytree(flight)
-    return Memory(added, jnp.array(True), empty_factors(flat.size, flat.dtype))
+    return Memory(added, jnp.array(True), kept_factors(flat.size, flat.dtype))
 
 
 def solve(

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._linear import blocks_of, Symmetric
 from .._system import (
     AbstractSystem,
     HamiltonianSystem,
@@ -20,9 +21,10 @@ from .shapes import describe, energies
 @eqx.filter_jit
 def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]:
     inertia = system.inertia(state, args)
-    masses, eps = jnp.diagonal(inertia), 1e3 * jnp.finfo(inertia.dtype).eps
+    blocks, eps = blocks_of(inertia), 1e3 * jnp.finfo(inertia.dtype).eps
+    masses = jnp.diagonal(blocks, axis1=1, axis2=2)
     root = jnp.sqrt(jnp.where(masses > 0, masses, 1))
-    scaled = inertia / jnp.outer(root, root)
+    scaled = blocks / (root[:, :, None] * root[:, None, :])
     finite = lambda tree: jnp.all(
         jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(tree)], bool)
     )
@@ -36,13 +38,13 @@ def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]
         constraint=finite([f(state.q, args) for f in constraints if f is not None]),
         inertia=finite(inertia),
         quadratic=_is_quadratic(system, state, inertia, args),
-        symmetric=jnp.all(jnp.abs(scaled - scaled.T) <= eps),
+        symmetric=jnp.all(jnp.abs(scaled - jnp.swapaxes(scaled, 1, 2)) <= eps),
         definite=jnp.all(masses > 0) & finite(jnp.linalg.cholesky(scaled)),
     )
 
 
 def _is_quadratic(
-    system: AbstractSystem, state: State, inertia: Array, args: Args
+    system: AbstractSystem, state: State, inertia: Symmetric, args: Args
 ) -> Array:
     """Whether the kinetic energy is `1/2 v . inertia v`; a Hamiltonian need not be."""
     if isinstance(system, HamiltonianSystem):
@@ -53,7 +55,7 @@ def _is_quadratic(
     probe = (1 + jnp.max(jnp.abs(v))) * jnp.cos(jnp.arange(1, v.size + 1, dtype=v.dtype))
     quadratic = 0.5 * probe @ inertia @ probe
     error = jnp.abs(energy(probe) - quadratic) + jnp.abs(energy(-probe) - quadratic)
-    size = jnp.abs(probe) @ jnp.abs(inertia) @ jnp.abs(probe)
+    size = jnp.abs(probe) @ jax.tree.map(jnp.abs, inertia) @ jnp.abs(probe)
     return error <= 1e3 * jnp.finfo(v.dtype).eps * size
 
 

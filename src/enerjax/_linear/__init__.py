@@ -1,7 +1,16 @@
-from .dense import (
-    AbstractFactors as AbstractFactors,
-    empty_factors as empty_factors,
-    inverse as inverse,
-    solve as solve,
+from .blocks import (
+    blocks_of as blocks_of,
+    as_dense as as_dense,
+    hessian as hessian,
+    in_blocks as in_blocks,
+    inverse_of as inverse_of,
+    Symmetric as Symmetric,
 )
-from .dots import plain_products as plain_products
+from .dense import AbstractFactors as AbstractFactors, inverse as inverse
+from .jacobian import (
+    affine_root as affine_root,
+    jacobian_rows as jacobian_rows,
+    kept_factors as kept_factors,
+    Linearisable as Linearisable,
+    linearisable as linearisable,
+)

@@ -79,12 +79,6 @@ class AbstractFactors(eqx.Module):
         """Nearly `matrix^-1 right`; not finite where the matrix is singular."""
 
 
-def empty_factors(size: int, dtype: Any) -> AbstractFactors:
-    """Of no matrix yet: the form for its size."""
-    zero = jnp.zeros((size, size), dtype)
-    return Inverse(zero) if size <= SMALL else LU(zero, jnp.arange(size))
-
-
 class Inverse(AbstractFactors):
     """An approximate inverse, which a chord iteration makes good.
 
@@ -94,6 +88,10 @@ class Inverse(AbstractFactors):
     """
 
     inverse: Float[Array, "n n"]
+
+    @classmethod
+    def empty(cls, size: int, dtype: Any) -> "Inverse":
+        return cls(jnp.zeros((size, size), dtype))
 
     def renewed(self, matrix: Float[Array, "n n"]) -> "Inverse":
         defect = jnp.eye(matrix.shape[0], dtype=matrix.dtype) - _product(
@@ -130,6 +128,10 @@ class LU(AbstractFactors):
 
     factors: Float[Array, "n n"]
     permutation: Int[Array, " n"]
+
+    @classmethod
+    def empty(cls, size: int, dtype: Any) -> "LU":
+        return cls(jnp.zeros((size, size), dtype), jnp.arange(size))
 
     def renewed(self, matrix: Float[Array, "n n"]) -> "LU":
         factors, _, permutation = jax.lax.linalg.lu(matrix)

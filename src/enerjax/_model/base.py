@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._discrete import AbstractDerivative
+from .._linear import jacobian_rows, Symmetric
 from .._system import AbstractSystem, State
 from .._types import (
     Args,
@@ -140,11 +141,11 @@ class AbstractModel(eqx.Module):
         """The rates of the coordinates, `L(q)^+ v` or `dH/dp`."""
 
     @abc.abstractmethod
-    def metric(self, state: State) -> Float[Array, "nq nq"]:
+    def metric(self, state: State) -> Symmetric:
         """The inertia in the coordinates, regular."""
 
     @abc.abstractmethod
-    def mobility(self, state: State) -> Float[Array, "nv nv"]:
+    def mobility(self, state: State) -> Symmetric:
         """Takes a push on `psi(q, .)` to the smallest change of `v`, in the inertia."""
 
     @abc.abstractmethod
@@ -167,9 +168,6 @@ class AbstractModel(eqx.Module):
     def constraint(self, q: Coordinates) -> Multipliers:
         """`Phi(q)`: joints first, then coordinate constraints."""
 
-    def constraint_jacobian(self, q: Coordinates) -> Float[Array, "nc nq"]:
-        return jax.jacfwd(self.constraint)(q)
-
     def joint_rate(self, q: Coordinates, v: Velocities) -> JointMultipliers:
         """`psi(q, v) = dPhi/dt` of the joints."""
         return jax.jvp(self.joint, (q,), (self.lift(q, v),))[1]
@@ -187,12 +185,11 @@ class AbstractModel(eqx.Module):
     def _scales(self, state: State) -> Scales:
         """The scales at `q`. They steer Newton's tests and never enter a solution."""
         q = state.q
-        coordinate = jnp.sqrt(jnp.diagonal(self.metric(state)))
-        jacobian = self.constraint_jacobian(q)
-        squares = (jacobian / coordinate[None, :]) ** 2
-        constraint = jnp.sqrt(jnp.sum(squares, axis=1))
+        coordinate = jnp.sqrt(self.metric(state).diagonal())
+        entries, columns = jacobian_rows(self.constraint, q)
+        constraint = jnp.sqrt(jnp.sum((entries / coordinate[columns]) ** 2, axis=1))
         # A gradient that vanishes makes the step equations singular, which is reported
         # as such; it must not turn the scaling into a division by zero.
         constraint = jnp.where(constraint > 0, constraint, 1.0)
-        size = jnp.abs(jacobian) @ jnp.abs(q)
+        size = jnp.sum(jnp.abs(entries * q[columns]), axis=1)
         return jax.lax.stop_gradient(Scales(coordinate, constraint, size))

@@ -121,7 +121,7 @@ class CanonicalModel(AbstractModel):
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
         q, p = state.q, state.v
         force, rate = jax.grad(self.hamiltonian, argnums=(0, 1))(q, p)
-        jacobian = self.constraint_jacobian(q)
+        jacobian = jax.jacfwd(self.constraint)(q)
         if jacobian.shape[0] == 0:
             return -force, jnp.zeros((0,), q.dtype)
         rates = jax.jacfwd(self.joint_rate, argnums=1)(q, p)

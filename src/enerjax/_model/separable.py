@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from .._discrete import AbstractDerivative
 from .._kinematics import IdentityKinematics
+from .._linear import affine_root, as_dense, inverse_of, Symmetric
 from .._system import State, System
 from .._types import (
     Args,
@@ -33,19 +34,15 @@ class SeparableModel(AbstractModel):
 
     system: System
     args: Args
-    inertia: Float[Array, "nv nv"]
-    inverse_inertia: Float[Array, "nv nv"]
+    inertia: Symmetric
+    inverse_inertia: Symmetric
     scales: Scales
 
     def __init__(self, system: System, state: State, args: Args):
         self.system = system
         self.args = args
         self.inertia = system.inertia(state, args)
-        # Scaled to a unit diagonal first: a diagonal inertia is then inverted to the last
-        # digit, whatever the mass ratios are.
-        root = jnp.sqrt(jnp.diagonal(self.inertia))
-        scale = jnp.outer(root, root)
-        self.inverse_inertia = jnp.linalg.inv(self.inertia / scale) / scale
+        self.inverse_inertia = inverse_of(self.inertia)
         self.scales = self._scales(state)
 
     @property
@@ -148,7 +145,7 @@ class SeparableModel(AbstractModel):
         """`D_mu (eta . psi) = 1/2 M^-1 (C_a + C_b)^T eta`"""
         return 0.5 * (self.reaction_at(qa, eta) + self.reaction_at(qb, eta))
 
-    def metric(self, state: State) -> Float[Array, "nq nq"]:
+    def metric(self, state: State) -> Symmetric:
         """The inertia in the coordinates, made regular where they are redundant.
 
         `L^T M L + sum_i g_i b_i b_i^T` with the gradients `b_i` of the coordinate
@@ -159,19 +156,19 @@ class SeparableModel(AbstractModel):
             return self.inertia
         q = state.q
         pull = jax.vmap(self._pull, in_axes=(None, 0))
-        inertia = pull(q, pull(q, self.inertia).T)
+        inertia = pull(q, pull(q, as_dense(self.inertia)).T)
         rows = jax.jacfwd(self.coordinate)(q)
         unit = rows / jnp.linalg.norm(rows, axis=1, keepdims=True)
         return inertia + jnp.trace(inertia) / q.size * (unit.T @ unit)
 
-    def mobility(self, state: State) -> Float[Array, "nv nv"]:
+    def mobility(self, state: State) -> Symmetric:
         return self.inverse_inertia
 
     def stiffness(
         self, state: State, multipliers: Multipliers
     ) -> tuple[Float[Array, "nq nq"], Float[Array, "nq nq"]]:
         strain = jax.hessian(lambda q: self.strain(q, multipliers))
-        return strain(state.q), self.inertia
+        return strain(state.q), as_dense(self.inertia)
 
     def strain(self, q: Coordinates, multipliers: Multipliers) -> Scalar:
         """`V + lambda . Phi`, the energy whose Hessian is the stiffness."""
@@ -181,25 +178,25 @@ class SeparableModel(AbstractModel):
         """The constraints enter twice differentiated; coordinate constraints have no
         acceleration level of their own (their multipliers close the `nq` rows).
         """
-        q, v = state.q, state.v
+        q, v, scales = state.q, state.v, self.scales
         qdot = self.lift(q, v)
-        pull = jax.vmap(self._pull, in_axes=(None, 0))
-        force = -jax.grad(self._potential)(q)
+        force = jax.grad(self._potential)(q)
         gyroscopic = self.system.kinematics.gyroscopic(q, self.inertia @ v, qdot, self.args)
         if gyroscopic is not None:
-            force = force - gyroscopic
-        jacobian = self.constraint_jacobian(q)
-        rate_jacobian = jax.jacfwd(self.joint_rate, argnums=1)(q, v)
+            force = force + gyroscopic
         _, drift = jax.jvp(lambda x: self.joint_rate(x, v), (q,), (qdot,))
-        num_joints = rate_jacobian.shape[0]
-        corner = jnp.zeros((num_joints, jacobian.shape[0]), q.dtype)
-        matrix = jnp.block([[pull(q, self.inertia).T, jacobian.T], [rate_jacobian, corner]])
-        scales = self.scales
-        rows = jnp.concatenate([1 / scales.coordinate, 1 / scales.constraint[:num_joints]])
-        columns = jnp.concatenate(
-            [1 / jnp.sqrt(jnp.diagonal(self.inertia)), 1 / scales.constraint]
-        )
-        scaled = rows[:, None] * matrix * columns[None, :]
-        right = rows * jnp.concatenate([force, -drift])
-        solution = columns * jnp.linalg.solve(scaled, right)
-        return solution[: v.size], solution[v.size :]
+        _, transpose = jax.vjp(self.constraint, q)
+        unit = 1 / jnp.sqrt(self.inertia.diagonal())
+
+        def conditions(x: Array) -> Array:
+            acceleration, multipliers = unit * x[: v.size], x[v.size :] / scales.constraint
+            pulled = self._pull(q, self.inertia @ acceleration) + transpose(multipliers)[0]
+            rate = self.joint_rate(q, acceleration) + drift
+            rows = (
+                (pulled + force) / scales.coordinate,
+                rate / scales.constraint[: rate.size],
+            )
+            return jnp.concatenate(rows)
+
+        x = affine_root(conditions, jnp.zeros((v.size + scales.constraint.size,), q.dtype))
+        return unit * x[: v.size], x[v.size :] / scales.constraint

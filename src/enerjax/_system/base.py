@@ -23,6 +23,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._linear import Symmetric
 from .._types import Args, Coordinates, Multipliers, Scalar
 
 
@@ -61,7 +62,7 @@ class AbstractSystem(eqx.Module):
         """Total energy of one state."""
 
     @abc.abstractmethod
-    def inertia(self, state: State, args: Args) -> Float[Array, "nv nv"]:
+    def inertia(self, state: State, args: Args) -> Symmetric:
         """The symmetric matrix that takes velocities to momenta."""
 
 

@@ -9,6 +9,7 @@ from .._kinematics import (
     ConfigurationKinematics,
     IdentityKinematics,
 )
+from .._linear import hessian, in_blocks, Symmetric
 from .._types import Args, Coordinates, Multipliers, Scalar, Velocities
 from .base import AbstractSystem, check_function, inexact, State
 from .canonical import HamiltonianSystem, LagrangianSystem
@@ -39,7 +40,7 @@ class System(AbstractSystem):
     run begins, where args and sizes are known.
     """
 
-    kinetic: Callable[[Velocities, Args], Scalar] | Float[Array, "nv nv"]
+    kinetic: Callable[[Velocities, Args], Scalar] | Symmetric
     potential: Callable[[Coordinates, Args], Scalar]
     constraint: Callable[[Coordinates, Args], Multipliers] | None
     kinematics: AbstractKinematics
@@ -68,7 +69,7 @@ class System(AbstractSystem):
                 "coordinates is an ordinary constraint. Pass it in `constraint`, or "
                 "give `kinematics`."
             )
-        self.kinetic = kinetic if callable(kinetic) else inexact(kinetic)
+        self.kinetic = kinetic if callable(kinetic) else in_blocks(inexact(kinetic))
         self.potential = potential
         self.constraint = constraint
         self.coordinate_constraint = coordinate_constraint
@@ -92,12 +93,12 @@ class System(AbstractSystem):
         """Total energy `1/2 v . M v + V(q)` of one state."""
         return self.kinetic_energy(state, args) + self.potential_energy(state, args)
 
-    def inertia(self, state: State, args: Args) -> Float[Array, "nv nv"]:
+    def inertia(self, state: State, args: Args) -> Symmetric:
         """`M`, constant."""
         if not callable(self.kinetic):
-            return self.kinetic.astype(state.v.dtype)
+            return jax.tree.map(lambda x: x.astype(state.v.dtype), self.kinetic)
         energy = lambda v: self.kinetic_energy(State(state.q, v), args)
-        return jax.hessian(energy)(jnp.zeros_like(state.v))
+        return hessian(energy, jnp.zeros_like(state.v))
 
     @staticmethod
     def from_lagrangian(

@@ -1,0 +1,183 @@
+"""Large sparse Jacobians: coloured columns, a narrow band, a block elimination.
+
+The unknowns are numbered by reverse Cuthill-McKee (E. Cuthill and J. McKee, 1969), which
+makes the Jacobian of chains, trees and most mechanisms a narrow band: block tridiagonal
+with blocks as wide as the band. It is eliminated block by block, with row pivoting over
+each pair of neighbours, which is all that the band leaves to choose from. All of it is
+written in JAX, so batches, accelerators and derivatives work.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+from .dense import AbstractFactors
+
+
+class Band:
+    """How a sparse matrix is stored as a band of blocks. Made while a program is traced.
+
+    - `colours`: of each column; columns of a colour share no row.
+    - `places`: for the entries `(block, row, 3 * width)` of the band, where they stand in
+      the coloured products; beyond the last of them where they are zero.
+    - `order`: the numbers of the unknowns along the band, filled up with the size.
+    - `back`: where each unknown stands along the band.
+    """
+
+    def __init__(self, pattern: csr_array):
+        size = pattern.shape[0]
+        both = (pattern + pattern.T).tocsr()
+        order = reverse_cuthill_mckee(both, symmetric_mode=True)
+        back = np.argsort(order)
+        rows, columns = pattern.nonzero()
+        offsets = back[columns] - back[rows]
+        self.width = width = max(int(np.max(np.abs(offsets), initial=1)), 1)
+        self.num_blocks = blocks = -(-size // width)
+        self.size = size
+        self.back = back
+        self.order = np.concatenate([order, np.full(blocks * width - size, size)])
+        self.colours = column_colours(pattern, order)
+        self.num_colours = int(self.colours.max(initial=0)) + 1
+        block, row = np.divmod(back[rows], width)
+        column = back[columns] - (block - 1) * width
+        nowhere = self.num_colours * size
+        self.places = np.full((blocks, width, 3 * width), nowhere)
+        self.places[block, row, column] = self.colours[columns] * size + rows
+
+    def worth_it(self) -> bool:
+        """Whether its elimination is less work than that of the dense matrix."""
+        return 40 * self.num_blocks * self.width**3 < self.size**3
+
+    def evaluate(
+        self, fn: Callable[[Array], Array], x: Float[Array, " n"]
+    ) -> tuple[Float[Array, "blocks width three_widths"], Float[Array, " n"]]:
+        """The band of the Jacobian of `fn` at `x`, and the value."""
+        value, products = coloured_products(fn, x, self.colours)
+        entries = jnp.append(products.ravel(), 0)
+        band = entries[self.places]
+        # Rows that only fill up the last block.
+        full = np.zeros(self.places.shape)
+        for k in range(self.size, self.num_blocks * self.width):
+            block, row = divmod(k, self.width)
+            full[block, row, self.width + row] = 1
+        return band + jnp.asarray(full, x.dtype), value
+
+
+def coloured_products(
+    fn: Callable[[Array], Array], x: Float[Array, " n"], colours: np.ndarray
+) -> tuple[Float[Array, " m"], Float[Array, "colours m"]]:
+    """The value, and for each colour the sum of the columns that have it."""
+    numbers = jnp.arange(int(colours.max(initial=0)) + 1)
+    seeds = (numbers[:, None] == jnp.asarray(colours)).astype(x.dtype)
+    push = lambda seed: jax.jvp(fn, (x,), (seed,))
+    return jax.vmap(push, out_axes=(None, 0))(seeds)
+
+
+def column_colours(pattern: csr_array, order: np.ndarray) -> np.ndarray:
+    """Greedy, along the band: the first colour that no column of a shared row has."""
+    by_column = pattern.tocsc()
+    seen: list[set[int]] = [set() for _ in range(pattern.shape[0])]
+    colours = np.zeros(pattern.shape[1], int)
+    for column in order:
+        rows = by_column.indices[by_column.indptr[column] : by_column.indptr[column + 1]]
+        taken = set().union(*(seen[row] for row in rows))
+        colour = next(c for c in range(len(taken) + 1) if c not in taken)
+        colours[column] = colour
+        for row in rows:
+            seen[row].add(colour)
+    return colours
+
+
+class BandFactors(AbstractFactors):
+    """An eliminated band.
+
+    - `turns`: for each block, what takes the rows left over and those of the next block to
+      the pivot rows, solved for their own unknowns, and to those left over.
+    - `upper`: the pivot rows in the unknowns of the next two blocks.
+    """
+
+    band: Band = eqx.field(static=True)
+    turns: Float[Array, "blocks two_widths two_widths"]
+    upper: Float[Array, "blocks width two_widths"]
+
+    @classmethod
+    def empty(cls, band: Band, dtype: Any) -> "BandFactors":
+        blocks, width = band.num_blocks, band.width
+        turns = jnp.zeros((blocks, 2 * width, 2 * width), dtype)
+        return cls(band, turns, jnp.zeros((blocks, width, 2 * width), dtype))
+
+    def renewed(self, matrix: Float[Array, "blocks width three_widths"]) -> "BandFactors":
+        width = self.band.width
+        none = jnp.zeros((width, width), matrix.dtype)
+        # Beyond the last block: rows of no other unknown.
+        beyond = jnp.concatenate([none, jnp.eye(width, dtype=matrix.dtype), none], axis=1)
+        following = jnp.concatenate([matrix[1:], beyond[None]])
+
+        def eliminate(left, rows):
+            whole = jnp.concatenate(
+                [jnp.concatenate([left, none], axis=1), rows]
+            )  # two_widths, three_widths
+            turned, turn = _pivot_rows_first(whole, width)
+            return turned[width:, width:], (turn, turned[:width, width:])
+
+        first = matrix[0, :, width:]
+        _, (turns, upper) = jax.lax.scan(eliminate, first, following)
+        return BandFactors(self.band, turns, upper)
+
+    def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
+        band, width = self.band, self.band.width
+        filled = jnp.append(right, 0)[band.order].reshape(band.num_blocks, width)
+        none = jnp.zeros((width,), right.dtype)
+
+        def forward(left, item):
+            turn, rows = item
+            turned = turn @ jnp.concatenate([left, rows])
+            return turned[width:], turned[:width]
+
+        following = jnp.concatenate([filled[1:], none[None]])
+        _, reduced = jax.lax.scan(forward, filled[0], (self.turns, following))
+
+        def backward(after, item):
+            upper, value = item
+            x = value - upper @ after
+            return jnp.concatenate([x, after[:width]]), x
+
+        after = jnp.concatenate([none, none])
+        _, x = jax.lax.scan(backward, after, (self.upper, reduced), reverse=True)
+        return x.ravel()[band.back]
+
+
+def _pivot_rows_first(rows: Float[Array, "m w"], count: int) -> tuple[Array, Array]:
+    """Rows reduced so that the first `count` columns are those of the identity.
+
+    By Gauss-Jordan elimination with row pivoting; also returns the matrix that does it.
+    """
+    num_rows, num_columns = rows.shape
+    whole = jnp.concatenate([rows, jnp.eye(num_rows, dtype=rows.dtype)], axis=1)
+    numbers, counted = jnp.arange(num_rows), jnp.arange(count)
+
+    def column(k, carry):
+        whole, free, places = carry
+        entries = whole[:, k]
+        pivot = jnp.argmax(jnp.where(free, jnp.abs(entries), -1))
+        chosen = numbers == pivot
+        row = whole[pivot] / entries[pivot]
+        factors = jnp.where(chosen, 0, entries)
+        whole = jnp.where(chosen[:, None], row, whole - factors[:, None] * row)
+        return whole, free & ~chosen, jnp.where(counted == k, pivot, places)
+
+    carry = whole, jnp.ones((num_rows,), bool), jnp.zeros((count,), numbers.dtype)
+    whole, free, places = jax.lax.fori_loop(0, count, column, carry)
+    # What is left, in its order: the row of the first, second, ... that is free.
+    number_of = jnp.where(free, jnp.cumsum(free), 0)
+    left = jnp.arange(1, num_rows - count + 1)
+    rest = jnp.argmax(number_of[None, :] == left[:, None], axis=1)
+    whole = whole[jnp.concatenate([places, rest])]
+    return whole[:, :num_columns], whole[:, num_columns:]
