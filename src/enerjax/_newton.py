@@ -55,6 +55,8 @@ class _Iterate(eqx.Module):
     factors: AbstractFactors
     # Size of the last correction, infinite if there was none.
     size: Scalar
+    # Size of the residual that it was made from.
+    defect: Scalar
     corrections: Count
     jacobians: Count
     done: Flag
@@ -82,11 +84,13 @@ def newton_iterations(
         # Each unknown against itself: one scale for all would hide a light, slow body
         # beside a heavy, fast one. The floor is for unknowns that pass through zero.
         size = jnp.max(jnp.abs(correction) / (jnp.abs(x) + eps**0.125), initial=0.0)
-        done = (max_norm(value) <= newton.atol * eps) & (size <= eps**0.25)
+        defect = max_norm(value)
+        done = (defect <= newton.atol * eps) & (size <= eps**0.25)
         after = _Iterate(
             x,
             carry.factors,
             size,
+            defect,
             carry.corrections + 1,
             carry.jacobians,
             done,
@@ -99,7 +103,7 @@ def newton_iterations(
         return ~carry.done & (contraction < _SHRINKS)
 
     def chord(inner: tuple[_Iterate, Scalar]) -> tuple[_Iterate, Scalar]:
-        before, _ = inner
+        before, rate = inner
         value = residual.value(before.x)
         after, contraction = corrected(before, value)
         # The contraction of a chord is what its Jacobian is off by: it stays. At least as
@@ -107,12 +111,17 @@ def newton_iterations(
         shrinks = contraction < _SHRINKS
         left = after.size * jnp.maximum(contraction, before.size)
         converged = shrinks & (left <= newton.rtol * eps)
-        after = eqx.tree_at(lambda c: c.done, after, after.done | converged)
+        # One that shrank and no longer does has met the round-off.
+        tiny = (after.defect <= eps**0.875) & (after.size <= eps**0.25)
+        stalled = ~shrinks & (rate > 0) & tiny
         kept = shrinks | after.done
-        return jax.tree.map(lambda x, y: jnp.where(kept, x, y), after, before), contraction
+        carry = jax.tree.map(lambda x, y: jnp.where(kept, x, y), after, before)
+        done = after.done | converged | stalled
+        return eqx.tree_at(lambda c: c.done, carry, done), contraction
 
     def linearise(carry: _Iterate) -> _Iterate:
         jacobian, value = residual.jacobian(carry.x)
+        last = carry.defect
         carry = eqx.tree_at(
             lambda c: (c.factors, c.jacobians),
             carry,
@@ -120,9 +129,12 @@ def newton_iterations(
         )
         carry, contraction = corrected(carry, value)
         # With a Jacobian of its own a small correction shrinks, unless it is round-off.
-        stalled = (max_norm(value) <= eps**0.75) & (carry.size <= eps**0.25)
-        done = carry.done | (stalled & (contraction >= _SHRINKS))
+        # So does the residual, whatever its round-off is.
+        tiny = (carry.defect <= eps**0.75) | (carry.defect > _SHRINKS * last)
+        stalled = tiny & (carry.size <= eps**0.25) & (contraction >= _SHRINKS)
+        done = carry.done | stalled
         carry = eqx.tree_at(lambda c: c.done, carry, done & jnp.isfinite(carry.size))
+        # No contraction is known of this Jacobian yet.
         begin = jnp.where(jnp.isfinite(carry.size), 0.0, jnp.inf).astype(x0.dtype)
         carry, _ = jax.lax.while_loop(converging, chord, (carry, begin))
         broken = ~jnp.isfinite(carry.size)
@@ -141,6 +153,6 @@ def newton_iterations(
 
     infinite, none, no = jnp.asarray(jnp.inf, x0.dtype), jnp.array(0), jnp.array(False)
     factors = residual.no_factors(start.factors, x0)
-    first = _Iterate(x0, factors, infinite, none, none, start.skip, no)
+    first = _Iterate(x0, factors, infinite, infinite, none, none, start.skip, no)
     unfinished = lambda c: ~(c.done | c.broken) & (c.jacobians < max_jacobians)
     return jax.lax.while_loop(unfinished, linearise, first)
