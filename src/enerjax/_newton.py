@@ -59,6 +59,8 @@ class _Iterate(eqx.Module):
     defect: Scalar
     corrections: Count
     jacobians: Count
+    # Jacobians in a row after which the correction was small and did not shrink.
+    stalls: Count
     done: Flag
     broken: Flag
 
@@ -68,6 +70,7 @@ class _Iterate(eqx.Module):
 _PATIENCE = 12
 # What a correction may leave of the one before, for its Jacobian to serve on.
 _SHRINKS = 0.3
+_STALLS = 4
 
 
 def newton_iterations(
@@ -93,6 +96,7 @@ def newton_iterations(
             defect,
             carry.corrections + 1,
             carry.jacobians,
+            carry.stalls,
             done,
             carry.broken,
         )
@@ -121,7 +125,6 @@ def newton_iterations(
 
     def linearise(carry: _Iterate) -> _Iterate:
         jacobian, value = residual.jacobian(carry.x)
-        last = carry.defect
         carry = eqx.tree_at(
             lambda c: (c.factors, c.jacobians),
             carry,
@@ -129,10 +132,12 @@ def newton_iterations(
         )
         carry, contraction = corrected(carry, value)
         # With a Jacobian of its own a small correction shrinks, unless it is round-off.
-        # So does the residual, whatever its round-off is.
-        tiny = (carry.defect <= eps**0.75) | (carry.defect > _SHRINKS * last)
-        stalled = tiny & (carry.size <= eps**0.25) & (contraction >= _SHRINKS)
-        done = carry.done | stalled
+        # Where the residual is not tiny (coordinates a million lengths off) it must have
+        # happened several times to be believed.
+        stalled = (carry.size <= eps**0.25) & (contraction >= _SHRINKS)
+        stalls = jnp.where(stalled, carry.stalls + 1, 0)
+        carry = eqx.tree_at(lambda c: c.stalls, carry, stalls)
+        done = carry.done | (stalled & (carry.defect <= eps**0.75)) | (stalls == _STALLS)
         carry = eqx.tree_at(lambda c: c.done, carry, done & jnp.isfinite(carry.size))
         # No contraction is known of this Jacobian yet.
         begin = jnp.where(jnp.isfinite(carry.size), 0.0, jnp.inf).astype(x0.dtype)
@@ -153,6 +158,6 @@ def newton_iterations(
 
     infinite, none, no = jnp.asarray(jnp.inf, x0.dtype), jnp.array(0), jnp.array(False)
     factors = residual.no_factors(start.factors, x0)
-    first = _Iterate(x0, factors, infinite, infinite, none, none, start.skip, no)
+    first = _Iterate(x0, factors, infinite, infinite, none, none, none, start.skip, no)
     unfinished = lambda c: ~(c.done | c.broken) & (c.jacobians < max_jacobians)
     return jax.lax.while_loop(unfinished, linearise, first)

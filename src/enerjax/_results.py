@@ -1,6 +1,8 @@
 """How a step can end. Failures are values: each step of each lane carries one."""
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 
 from ._types import Flag
 
@@ -41,3 +43,10 @@ def from_root_finder(found: Flag, broken: Flag) -> RESULTS:
     """What the end of an iteration means for a step."""
     failure = RESULTS.where(broken, RESULTS.nonfinite, RESULTS.not_converged)
     return RESULTS.where(found, RESULTS.successful, failure)
+
+
+def first_of(results: RESULTS) -> RESULTS:
+    """The first failure along the leading axis of stacked results."""
+    failed = results != RESULTS.successful
+    first = jnp.argmax(failed)
+    return jax.tree.map(lambda x: x[first], results)

@@ -16,8 +16,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from ._linear import AbstractFactors, kept_factors, linearisable
-from ._tracing import is_known
 from ._newton import Newton, newton_iterations, Start
+from ._tracing import is_known
 from ._types import Count, Flag
 
 

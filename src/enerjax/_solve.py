@@ -15,16 +15,18 @@ from jaxtyping import PyTree
 from ._linear import AbstractFactors, kept_factors
 from ._model import AbstractModel
 from ._newton import max_norm
-from ._results import first_failure, from_root_finder
+from ._results import first_failure, first_of, from_root_finder, RESULTS
 from ._root import find_root, RootFinder
 from ._scaling import scales_like
-from ._schemes import AbstractSingleSolve
+from ._schemes import AbstractSingleSolve, StepEnd
 from ._system import State
-from ._types import Flag, Multipliers, Scalar, Velocities
+from ._types import Count, Flag, Multipliers, Scalar, Velocities
 
 
 # Enough for the linear convergence of a locking step; a step that needs more has failed.
 MAX_ITERATIONS = 50
+# Into which a step is divided where it fails.
+_PARTS = 8
 
 
 class Memory(eqx.Module):
@@ -66,7 +68,57 @@ def solve(
     memory: Memory,
     root_finder: RootFinder,
     skip: Flag,
-):
+) -> tuple[StepEnd, Count, RESULTS, Memory]:
+    """A step, or, where a large system fails in it, the same step in parts.
+
+    In the whip of a chain the equations of a few steps have no solution that Newton could
+    find; those of shorter steps have. For small systems the second program would cost
+    every step more than it is worth.
+    """
+    whole = _attempt(scheme, model, start, h, memory, root_finder, skip)
+    if memory.factors is not None:
+        return whole
+    _, iterations, result, _ = whole
+    failed = (result != RESULTS.successful) & ~skip
+
+    def in_parts():
+        begin = lambda state, length: first_memory(
+            scheme, model, state, length, *model.accelerations(state)
+        )
+
+        def part(carry, _):
+            state, memory, failed = carry
+            end, iterations, result, memory = _attempt(
+                scheme, model, state, h / _PARTS, memory, root_finder, failed
+            )
+            failed = failed | (result != RESULTS.successful)
+            return (end.state, memory, failed), (end, iterations, result)
+
+        carry = start, begin(start, h / _PARTS), ~failed
+        (state, _, _), parts = jax.lax.scan(part, carry, None, length=_PARTS)
+        ends, counts, results = parts
+        end = StepEnd(
+            state,
+            jnp.sum(ends.displacement, axis=0),
+            jnp.mean(ends.multipliers, axis=0),
+            jnp.sum(ends.dissipated),
+            jax.tree.map(lambda x: x[-1], ends.details),
+            first_of(ends.result),
+        )
+        return end, iterations + jnp.sum(counts), first_of(results), begin(state, h)
+
+    return jax.lax.cond(failed, in_parts, lambda: whole)
+
+
+def _attempt(
+    scheme: AbstractSingleSolve,
+    model: AbstractModel,
+    start: State,
+    h: Scalar,
+    memory: Memory,
+    root_finder: RootFinder,
+    skip: Flag,
+) -> tuple[StepEnd, Count, RESULTS, Memory]:
     problem = scheme.problem(model, start, h)
     flight = _free_flight(scheme, problem, model, start)
     unknown_scale, row_scale = scales_like(flight, model, start, h)

@@ -13,7 +13,7 @@ from jaxtyping import Array, PyTree
 from ._check import prepare
 from ._model import AbstractModel, make_model
 from ._newton import Newton
-from ._results import RESULTS
+from ._results import first_of, RESULTS
 from ._root import RootFinder
 from ._schemes import AbstractScheme
 from ._solve import first_memory, Memory, solve
@@ -108,7 +108,7 @@ def advance(
         jnp.sum(dissipated),
         jax.tree.map(lambda x: x[-1], details),
         jnp.sum(iterations),
-        _first_of(results),
+        first_of(results),
         Warm(memory, rest),
     )
 
@@ -173,10 +173,3 @@ def step(
     """
     state, args, h = prepare(system, scheme, state, args, h, root_finder)
     return _single_step(system, scheme, state, args, h, warm, root_finder)
-
-
-def _first_of(results: RESULTS) -> RESULTS:
-    """The first failure along the leading axis of stacked results."""
-    failed = results != RESULTS.successful
-    first = jnp.argmax(failed)
-    return jax.tree.map(lambda x: x[first], results)

@@ -1,6 +1,6 @@
 from .blocks import (
-    blocks_of as blocks_of,
     as_dense as as_dense,
+    blocks_of as blocks_of,
     hessian as hessian,
     in_blocks as in_blocks,
     inverse_of as inverse_of,

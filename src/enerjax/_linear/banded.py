@@ -19,6 +19,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from .dense import AbstractFactors
+from .dependence import shape_of
 
 
 class Band:
@@ -32,7 +33,7 @@ class Band:
     """
 
     def __init__(self, pattern: csr_array):
-        size = pattern.shape[0]
+        size, _ = shape_of(pattern)
         both = (pattern + pattern.T).tocsr()
         order = reverse_cuthill_mckee(both, symmetric_mode=True)
         back = np.argsort(order)
@@ -75,7 +76,7 @@ def coloured_products(
 ) -> tuple[Float[Array, " m"], Float[Array, "colours m"]]:
     """The value, and for each colour the sum of the columns that have it."""
     numbers = jnp.arange(int(colours.max(initial=0)) + 1)
-    seeds = (numbers[:, None] == jnp.asarray(colours)).astype(x.dtype)
+    seeds = (numbers[:, None] == jnp.asarray(colours)[None, :]).astype(x.dtype)
     push = lambda seed: jax.jvp(fn, (x,), (seed,))
     return jax.vmap(push, out_axes=(None, 0))(seeds)
 
@@ -83,8 +84,9 @@ def coloured_products(
 def column_colours(pattern: csr_array, order: np.ndarray) -> np.ndarray:
     """Greedy, along the band: the first colour that no column of a shared row has."""
     by_column = pattern.tocsc()
-    seen: list[set[int]] = [set() for _ in range(pattern.shape[0])]
-    colours = np.zeros(pattern.shape[1], int)
+    num_rows, num_columns = shape_of(pattern)
+    seen: list[set[int]] = [set() for _ in range(num_rows)]
+    colours = np.zeros(num_columns, int)
     for column in order:
         rows = by_column.indices[by_column.indptr[column] : by_column.indptr[column + 1]]
         taken = set().union(*(seen[row] for row in rows))
@@ -170,7 +172,7 @@ def _pivot_rows_first(rows: Float[Array, "m w"], count: int) -> tuple[Array, Arr
         chosen = numbers == pivot
         row = whole[pivot] / entries[pivot]
         factors = jnp.where(chosen, 0, entries)
-        whole = jnp.where(chosen[:, None], row, whole - factors[:, None] * row)
+        whole = jnp.where(chosen[:, None], row[None], whole - factors[:, None] * row[None])
         return whole, free & ~chosen, jnp.where(counted == k, pivot, places)
 
     carry = whole, jnp.ones((num_rows,), bool), jnp.zeros((count,), numbers.dtype)

@@ -12,7 +12,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from .._tracing import is_known
-from .pattern import Dense, jacobian_pattern
+from .dependence import Dense
+from .pattern import jacobian_pattern
 
 
 # Rows from which structure is looked for, and of the largest block that counts as small.
@@ -54,7 +55,8 @@ class BlockDiagonal(eqx.Module):
 
     @property
     def shape(self) -> tuple[int, int]:
-        return (self.places.back.size,) * 2
+        size = self.places.back.size
+        return size, size
 
     @property
     def dtype(self) -> Any:
@@ -78,7 +80,11 @@ Symmetric: TypeAlias = Float[Array, "n n"] | BlockDiagonal
 def inverse_of(matrix: Symmetric) -> Symmetric:
     """Of a positive definite matrix."""
     if isinstance(matrix, BlockDiagonal):
-        return BlockDiagonal(matrix.places, jax.vmap(inverse_of)(matrix.blocks))
+        return BlockDiagonal(matrix.places, jax.vmap(_inverse)(matrix.blocks))
+    return _inverse(matrix)
+
+
+def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     # Scaled to a unit diagonal first: a diagonal one is then inverted to the last digit,
     # whatever the ratios are.
     root = jnp.sqrt(jnp.diagonal(matrix))

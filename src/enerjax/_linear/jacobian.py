@@ -11,8 +11,9 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from .banded import Band, BandFactors, coloured_products, column_colours
 from .dense import AbstractFactors, Inverse, LU, SMALL, solve
+from .dependence import Dense
 from .dots import plain_products
-from .pattern import Dense, jacobian_pattern
+from .pattern import jacobian_pattern
 
 
 # Unknowns from which structure is looked for.
@@ -40,7 +41,9 @@ class Linearisable(eqx.Module):
 
         return jax.jacfwd(with_value, has_aux=True)(x)
 
-    def no_factors(self, like: AbstractFactors, x: Float[Array, " n"]) -> AbstractFactors:
+    def no_factors(
+        self, like: AbstractFactors | None, x: Float[Array, " n"]
+    ) -> AbstractFactors:
         """Where an iteration begins: with those of a problem before, where they help."""
         if isinstance(like, Inverse):
             return like

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._discrete import AbstractDerivative
+from .._linear import as_dense
 from .._system import AbstractCanonicalSystem, State
 from .._types import (
     Args,
@@ -105,7 +106,7 @@ class CanonicalModel(AbstractModel):
         return transpose(eta)[0]
 
     def metric(self, state: State) -> Float[Array, "nq nq"]:
-        return self.system.inertia(self.leave(state), self.args)
+        return as_dense(self.system.inertia(self.leave(state), self.args))
 
     def mobility(self, state: State) -> Float[Array, "nv nv"]:
         return self.metric(state)

@@ -1,0 +1,239 @@
+"""Systems of many unknowns: the pattern of the Jacobian, the band, and what runs on them."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from scipy.sparse import csr_array
+
+import enerjax as ej
+from enerjax._linear.banded import Band, BandFactors
+from enerjax._linear.blocks import BlockDiagonal, hessian, inverse_of
+from enerjax._linear.pattern import jacobian_pattern
+
+from .helpers import EPS
+
+
+MATRIX = jnp.asarray(np.random.default_rng(0).normal(size=(5, 6)))
+FUNCTIONS = {
+    "rods": (lambda x: jnp.sum(jnp.diff(x.reshape(-1, 2), axis=0) ** 2, axis=1), True),
+    "springs": (
+        jax.grad(lambda x: jnp.sum(jnp.linalg.norm(jnp.diff(x.reshape(-1, 2), axis=0)))),
+        False,
+    ),
+    "discrete": (
+        lambda x: ej.discrete_grad(
+            lambda y: jnp.sum(jnp.diff(y.reshape(-1, 2), axis=0) ** 4)
+        )(x, x + 1.0),
+        True,
+    ),
+    "gather": (lambda x: x[jnp.array([1, 3, 5])] * x[::2][:3], True),
+    "scatter": (
+        lambda x: jnp.zeros(6).at[jnp.array([0, 2, 2])].add(x[6:9] ** 2) + x[:6],
+        True,
+    ),
+    "set": (lambda x: x.at[2].set(x[0] * x[1]), True),
+    "dot": (lambda x: MATRIX @ x[:6], True),
+    "dots": (lambda x: (x[:6].reshape(2, 3) @ x[6:].reshape(3, 2)).ravel(), True),
+    "batched": (
+        lambda x: jnp.einsum("bi,bij->bj", x[:4].reshape(2, 2), x[4:].reshape(2, 2, 2)),
+        True,
+    ),
+    "choice": (lambda x: jnp.where(jnp.arange(x.size) > 4, x, x[::-1]), True),
+    "concatenate": (lambda x: jnp.concatenate([x[:2], jnp.zeros(3), x[4:] ** 2]), True),
+    "cross": (lambda x: jnp.cross(x[:3], x[3:6]), False),
+    "stack": (lambda x: jnp.stack([x[0] * x[1], jnp.sin(x[2]), x[11]]), True),
+    "roll": (lambda x: jnp.roll(x, 1) * x, True),
+    "vmap": (lambda x: jax.vmap(lambda i: x[i] * x[i + 1])(jnp.arange(11)), True),
+    "outer": (lambda x: jnp.outer(x, x)[jnp.triu_indices(3)], True),
+    "mask": (lambda x: (jnp.eye(12) * x[None, :] * x[:, None]).sum(axis=1), True),
+    "norm": (lambda x: x / jnp.linalg.norm(x), True),
+    "scan": (lambda x: jax.lax.scan(lambda c, y: (c + y, c), 0.0, x)[1], False),
+    "max": (lambda x: jnp.max(x.reshape(3, 4), axis=1), False),
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_the_pattern_covers_the_jacobian(name):
+    fn, is_exact = FUNCTIONS[name]
+    x = jnp.asarray(np.random.default_rng(1).normal(size=12))
+    pattern = jacobian_pattern(fn, x).toarray()
+    jacobian = np.asarray(jax.jacfwd(fn)(x) != 0).reshape(pattern.shape)
+    assert not np.any(jacobian & ~pattern)
+    if is_exact:
+        np.testing.assert_array_equal(jacobian, pattern)
+
+
+def _banded(size, rng):
+    """A shuffled band without a dominant, or even a full, diagonal."""
+    matrix = np.zeros((size, size))
+    for k in range(size):
+        low, high = max(0, k - 4), min(size, k + 4)
+        matrix[k, low:high] = rng.normal(size=high - low) * (rng.random(high - low) < 0.6)
+    matrix[np.arange(size), np.arange(size)] *= rng.random(size) < 0.4
+    matrix += np.diag(np.ones(size - 1), 1)
+    order = rng.permutation(size)
+    return matrix[order][:, order]
+
+
+@pytest.mark.parametrize("size", [30, 101, 300])
+def test_a_shuffled_band_is_found_and_solved(size):
+    rng = np.random.default_rng(size)
+    matrix, right = _banded(size, rng), rng.normal(size=size)
+    band = Band(csr_array(matrix != 0))
+    assert band.width <= 12
+    entries, _ = band.evaluate(lambda x: jnp.asarray(matrix) @ x, jnp.zeros(size))
+    factors = BandFactors.empty(band, float).renewed(entries)
+    x = factors.solve(jnp.asarray(right))
+    bound = 1e3 * size * EPS * np.abs(matrix).max()  # round-off
+    size_of = np.abs(np.linalg.solve(matrix, right)).max()
+    assert np.max(np.abs(matrix @ x - right)) <= bound * size_of
+    y = jax.linear_transpose(factors.solve, right)(jnp.asarray(right))[0]
+    size_of = np.abs(np.linalg.solve(matrix.T, right)).max()
+    assert np.max(np.abs(matrix.T @ y - right)) <= bound * size_of
+
+
+def test_the_inertia_of_many_bodies_is_kept_in_blocks():
+    rng = np.random.default_rng(0)
+    blocks = rng.normal(size=(30, 3, 3))
+    blocks = jnp.asarray(blocks @ blocks.swapaxes(1, 2) + np.eye(3))
+    energy = lambda v: (
+        0.5 * jnp.einsum("ki,kij,kj", v[:90].reshape(-1, 3), blocks, v[:90].reshape(-1, 3))
+        + 2.0 * jnp.sum(v[90:] ** 2)
+    )
+    inertia, x = hessian(energy, jnp.zeros(97)), jnp.asarray(rng.normal(size=97))
+    assert isinstance(inertia, BlockDiagonal)
+    full = jax.hessian(energy)(jnp.zeros(97))
+    np.testing.assert_allclose(inertia @ x, full @ x, rtol=1e-13)
+    np.testing.assert_allclose(x @ inertia, full @ x, rtol=1e-13)
+    np.testing.assert_allclose(inertia.diagonal(), np.diagonal(full), rtol=1e-13)
+    np.testing.assert_allclose(inverse_of(inertia) @ (full @ x), x, rtol=1e-10)
+
+
+NUM_LINKS = 20
+
+
+@functools.cache
+def _chain(scheme):
+    system, start, args = ej.problems.chain(NUM_LINKS)
+    return ej.simulate(system, scheme, start, args, h=2e-3, num_steps=20)
+
+
+@pytest.mark.parametrize("scheme", [ej.EnergyPreserving(), ej.EnergyDecaying(0.5)])
+def test_a_chain_moves_as_with_a_dense_solver(scheme):
+    system, start, args = ej.problems.chain(NUM_LINKS)
+    dense = ej.simulate(
+        system, scheme, start, args,
+        h=2e-3, num_steps=20, root_finder=optx.Newton(1e-9, 1e-9),
+    )  # fmt: skip
+    run = _chain(scheme)
+    assert jnp.max(jnp.abs(run.ys.q - dense.ys.q)) <= 1e-10  # solver
+    assert jnp.max(jnp.abs(run.ys.v - dense.ys.v)) <= 1e-8
+    leak = jnp.diff(run.audit.energy) + run.audit.dissipated[1:]
+    assert jnp.max(jnp.abs(leak)) <= 50 * EPS
+    assert jnp.max(jnp.abs(run.audit.constraint)) <= 50 * EPS
+
+
+def test_derivatives_of_a_chain():
+    system, start, args = ej.problems.chain(NUM_LINKS)
+
+    def tip(m):
+        run = ej.simulate(
+            system, ej.EnergyPreserving(), start, args | {"m": m}, h=2e-3, num_steps=20
+        )
+        return run.ys.q[-1, -1]
+
+    direction = jnp.cos(jnp.arange(float(NUM_LINKS))) / NUM_LINKS
+    value = jax.grad(tip)(args["m"]) @ direction
+    _, pushed = jax.jvp(tip, (args["m"],), (direction,))
+    step = 1e-4
+    change = tip(args["m"] + step * direction) - tip(args["m"] - step * direction)
+    assert value == pytest.approx(float(pushed), rel=1e-10)  # round-off
+    assert value == pytest.approx(float(change / (2 * step)), rel=1e-6)  # truncation
+
+
+def _net(size):
+    """Points on a square net of springs, corners held by rods: loops, and no chain."""
+    index = np.arange(size * size).reshape(size, size)
+    pairs = np.concatenate(
+        [
+            np.stack([index[:, :-1].ravel(), index[:, 1:].ravel()]),
+            np.stack([index[:-1].ravel(), index[1:].ravel()]),
+        ],
+        axis=1,
+    )
+    corners = np.array([0, size - 1])
+    rest = np.stack(np.meshgrid(*[np.arange(float(size))] * 2, indexing="ij"), axis=-1)
+    rest = np.concatenate([rest, np.zeros((size, size, 1))], axis=2).reshape(-1, 3)
+    anchors = rest[corners] + np.array([0.0, 0.0, 1.0])
+
+    def potential(q, args):
+        x = q.reshape(-1, 3)
+        lengths = jnp.linalg.norm(x[pairs[0]] - x[pairs[1]], axis=1)
+        return 9.81 * jnp.sum(x[:, 2]) + 0.5 * args["k"] * jnp.sum((lengths - 1) ** 2)
+
+    def constraint(q, args):
+        return jnp.sum((q.reshape(-1, 3)[corners] - anchors) ** 2, axis=1) - 1
+
+    system = ej.System(jnp.eye(rest.size), potential, constraint)
+    args = {"k": 500.0}
+    return system, ej.initial_state(system, rest.ravel(), np.zeros(rest.size), args), args
+
+
+def test_a_net_with_loops():
+    system, start, args = _net(6)
+    assert isinstance(system.kinetic, BlockDiagonal)
+    runs = [
+        ej.simulate(
+            system, ej.EnergyPreserving(), start, args, h=h, num_steps=n, save_every=n
+        )
+        for h, n in ((4e-3, 25), (2e-3, 50), (1e-3, 100))
+    ]
+    for run in runs:
+        scale = np.max(run.audit.kinetic)
+        assert np.ptp(run.audit.energy) <= 1e3 * EPS * scale
+    coarse, fine = (runs[k].ys.q[-1] - runs[k + 1].ys.q[-1] for k in (0, 1))
+    ratio = np.max(np.abs(coarse)) / np.max(np.abs(fine))
+    assert ratio == pytest.approx(4, rel=0.1)  # second order
+
+
+def test_lanes_of_chains_move_alone():
+    system, start, args = ej.problems.chain(NUM_LINKS)
+    run = eqx.filter_jit(
+        lambda g: ej.simulate(
+            system, ej.EnergyPreserving(), start, args | {"g": g}, h=2e-3, num_steps=20
+        ).ys.q[-1]
+    )
+    both = jax.vmap(run)(jnp.array([9.81, 3.0]))
+    alone = _chain(ej.EnergyPreserving()).ys.q[-1]
+    assert jnp.max(jnp.abs(both[0] - alone)) <= 1e-11  # solver
+
+
+def test_repeated_constraints_of_a_large_system_are_reported():
+    system, start, args = ej.problems.chain(300)
+    twice = ej.System(
+        system.kinetic,
+        system.potential,
+        lambda q, args: jnp.concatenate([system.constraint(q, args)] * 2),
+    )
+    with pytest.raises(ValueError, match="do not determine their multipliers"):
+        ej.initial_state(twice, start.q, start.v, args)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("num_links", [64, 512])
+def test_the_whip(num_links):
+    """At the whip of the longer chain some steps have to be divided."""
+    system, start, args = ej.problems.chain(num_links)
+    run = ej.simulate(
+        system, ej.EnergyPreserving(), start, args, h=1e-3, num_steps=2000, save_every=10
+    )
+    turnover = float(jnp.sum(args["m"] * args["g"] * jnp.cumsum(args["l"])))
+    length = 1 / num_links
+    assert np.ptp(run.audit.energy) <= 1e-11 * turnover  # solver
+    assert np.max(np.abs(run.audit.constraint)) <= 1e-9 * length**2
+    assert np.max(np.abs(run.audit.constraint_rate)) <= 1e-9 * length**2
