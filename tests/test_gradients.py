@@ -7,6 +7,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import enerjax as ej
+from enerjax import _reverse
 
 from .helpers import problem, SCHEMES
 
@@ -78,27 +79,48 @@ def test_forward_reverse_and_differences_agree(scheme):
     assert abs(gradient["m"]) <= 1e-8
 
 
-def test_saving_less_does_not_change_the_gradient():
-    """With `save_every` the steps between are computed again in reverse mode."""
+def tip(g, steps, save_every):
     system, start, args = problem("pendulum")
+    solution = ej.simulate(
+        system,
+        ej.EnergyPreserving(),
+        start,
+        args | dict(g=g),
+        h=0.02,
+        num_steps=steps,
+        save_every=save_every,
+        throw=False,
+    )
+    return solution.ys.q[-1, 0]
 
-    def fn(g, save_every):
-        solution = ej.simulate(
-            system,
-            ej.EnergyPreserving(),
-            start,
-            args | dict(g=g),
-            h=0.02,
-            num_steps=STEPS,
-            save_every=save_every,
-            throw=False,
-        )
-        return solution.ys.q[-1, 0]
 
-    all_, some = (jax.grad(fn)(9.81, save_every) for save_every in (1, 20))
-    assert abs(all_) > 1e-3
-    # Round-off, grown over the steps.
-    np.testing.assert_allclose(some, all_, rtol=1e-11)
+# Steps that fill segments of the run, and that do not.
+@pytest.mark.parametrize(("steps", "long"), [(100, False), (101, False), (103, True)])
+def test_saving_less_does_not_change_the_gradient(steps, long, monkeypatch):
+    """What the reverse pass computes again is what the run computed."""
+    monkeypatch.setattr(_reverse, "LONG", 10 if long else _reverse.LONG)
+    forward = jax.jvp(lambda g: tip(g, steps, 1), (9.81,), (1.0,))[1]
+    assert abs(forward) > 1e-3
+    for save_every in (1, 20 if steps == 100 else steps):
+        reverse = jax.grad(tip)(9.81, steps, save_every)
+        # Round-off, grown over the steps.
+        np.testing.assert_allclose(reverse, forward, rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("steps", "limit"),
+    [
+        # Four unknowns a step: 8 bytes each, and the rest for the states in a segment.
+        (1000, 12 * 4 * 1000),
+        # 10^3 segments, whose starts hold what Newton needs to begin.
+        (1_000_000, 2_000_000),
+    ],
+)
+def test_memory_of_the_reverse_pass(steps, limit):
+    program = jax.jit(lambda g: jax.grad(tip)(g, steps, steps)).lower(9.81).compile()
+    memory = program.memory_analysis()
+    assert memory is not None
+    assert memory.temp_size_in_bytes <= limit
 
 
 def test_second_derivatives_exist():

@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
+from jax.ad_checkpoint import checkpoint_name
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
@@ -21,6 +22,8 @@ from ._tracing import is_known
 from ._types import Count, Flag
 
 
+# The name under which a policy of `jax.checkpoint` knows the value of a root.
+ROOT = "enerjax_root"
 RootFinder: TypeAlias = Newton | optx.AbstractRootFinder
 
 
@@ -81,6 +84,12 @@ def _root_jvp(primals, tangents):
     fn, root_finder, args, start, max_iterations = primals
     t_args = tangents[2]
     root = _root(fn, root_finder, args, start, max_iterations)
+    # All that the derivatives of a step need of the search for it.
+    root = eqx.tree_at(
+        lambda root: (root.value, root.found, root.broken),
+        root,
+        replace_fn=lambda x: jax.tree.map(lambda x: checkpoint_name(x, ROOT), x),
+    )
     is_none = lambda x: x is None
     unmoved = jax.tree.map(is_none, t_args, is_leaf=is_none)
     fixed, moved = eqx.partition(args, unmoved, is_leaf=is_none)

@@ -7,6 +7,7 @@ from ._check import positive_integer, prepare
 from ._model import AbstractModel, make_model
 from ._newton import Newton
 from ._results import first_failure, RESULTS
+from ._reverse import keep_roots, scans
 from ._root import RootFinder
 from ._schemes import AbstractScheme
 from ._solution import Solution, Statistics
@@ -53,8 +54,9 @@ def simulate(
     - `args`: any pytree, handed to the functions of the system.
     - `h`: length of a step (time), positive.
     - `num_steps`, `save_every`: every `save_every`-th state is saved, and the start. Their
-      quotient must be whole. In reverse mode the steps between two saves are computed
-      again instead of stored.
+      quotient must be whole. In reverse mode the solved unknowns of each step are stored
+      too, up to 10^4 steps; beyond, memory grows like the square root of the steps, at
+      the cost of one more run.
     - `root_finder`: for the step equations, which are scaled to order one (so tolerances
       are relative); one of optimistix can be given.
     - `throw`: raise an error at the end of a run that failed, which names the step, the
@@ -84,11 +86,12 @@ def _run(system, scheme, start, args, h, root_finder, num_steps, save_every):
     acceleration, multipliers0 = model.accelerations(start)
     warm = first_warm(scheme, model, start, h, acceleration, multipliers0)
 
-    def one_step(carry: _Carry, _):
-        skip = carry.result != RESULTS.successful
+    def one_step(carry: _Carry, live: Flag):
+        skip = (carry.result != RESULTS.successful) | ~live
         out = advance(scheme, model, carry.state, h, carry.warm, root_finder, skip)
         result = first_failure(carry.result, out.result)
-        good = result == RESULTS.successful
+        result = RESULTS.where(live, result, carry.result)
+        good = live & (result == RESULTS.successful)
         state, memory = _select(good, (out.state, out.warm), (carry.state, carry.warm))
         completed = carry.completed + good.astype(carry.completed.dtype)
         reported = (out.multipliers, out.details)
@@ -98,21 +101,20 @@ def _run(system, scheme, start, args, h, root_finder, num_steps, save_every):
             jnp.where(skip, 0, out.newton_iterations),
         )
 
-    def one_save(carry: _Carry, _):
-        carry, (reported, dissipated, iterations) = jax.lax.scan(
-            one_step, carry, None, length=save_every
+    num_saves = num_steps // save_every
+    scan_of_rows, scan_of_steps = scans(num_saves, save_every)
+
+    def one_save(carry: _Carry, live: Flag):
+        carry, (reported, dissipated, iterations) = scan_of_steps(
+            keep_roots(one_step), carry, jnp.full((save_every,), live)
         )
         last = jax.tree.map(lambda x: x[-1], reported)
         row = (carry.state, *last, jnp.sum(dissipated))
         good = carry.result == RESULTS.successful
         return carry, (_nan_unless(good, row), iterations)
 
-    if save_every > 1:
-        one_save = jax.checkpoint(one_save)
     begin = _Carry(start, warm, _check_start(scheme, model, start, h), jnp.array(0))
-    end, (rows, iterations) = jax.lax.scan(
-        one_save, begin, None, length=num_steps // save_every
-    )
+    end, (rows, iterations) = scan_of_rows(one_save, begin, jnp.ones((num_saves,), bool))
     states, multipliers, details, dissipated = rows
     row0 = (start, multipliers0, jnp.zeros_like(h))
     states, multipliers, dissipated = jax.tree.map(

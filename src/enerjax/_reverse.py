@@ -1,0 +1,63 @@
+"""Which numbers of a run are kept for the reverse pass, and which are computed again.
+
+A step is computed again from the state before it and its root, without a search. Runs are
+cut into segments of about the square root of their steps: the states within a segment are
+computed again from its start and its roots. Long runs keep the starts of segments alone,
+and search for the roots once more: the memory grows like the square root of the steps.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from ._root import ROOT
+
+
+# Steps beyond which the roots are not kept.
+LONG = 10_000
+
+Body: TypeAlias = Callable[[Any, Array], tuple[Any, Any]]
+Scan: TypeAlias = Callable[[Body, Any, Bool[Array, " length"]], tuple[Any, Any]]
+
+
+# In a loop nothing is merged with what a pass before computed.
+_checkpoint = functools.partial(jax.checkpoint, prevent_cse=False)
+
+
+def keep_roots(fn: Body) -> Body:
+    """`fn`, of which the reverse pass keeps the inputs and the roots."""
+    return _checkpoint(fn, policy=jax.checkpoint_policies.save_only_these_names(ROOT))
+
+
+def scans(rows: int, steps: int) -> tuple[Scan, Scan]:
+    """The loops over the rows of a run, and over the steps of a row."""
+    segment = math.isqrt(rows * steps)
+    keep = keep_roots if rows * steps <= LONG else _checkpoint
+    # One of both loops is cut: a segment is a group of rows, or a part of one.
+    if steps > segment:
+        return jax.lax.scan, functools.partial(_in_segments, keep, segment)
+    return functools.partial(_in_segments, keep, segment // steps), jax.lax.scan
+
+
+def _in_segments(
+    keep: Callable[[Body], Body],
+    about: int,
+    body: Body,
+    carry: Any,
+    live: Bool[Array, " length"],
+) -> tuple[Any, Any]:
+    """A scan over `live`, whose segments are checkpointed.
+
+    Where segments of no suitable length fill the run, turns that are not live are added.
+    """
+    length = live.size
+    size = min(range((about + 1) // 2, 2 * about + 1), key=lambda size: -length % size)
+    live = jnp.append(live, jnp.zeros((-length % size,), bool)).reshape(-1, size)
+    segment = keep(lambda carry, live: jax.lax.scan(body, carry, live))
+    carry, out = jax.lax.scan(segment, carry, live)
+    return carry, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:length], out)
