@@ -132,16 +132,15 @@ def show(rows: list[harness.Row]) -> None:
             continue
         anchor = anchors.get(row["work"])
         ratio = f"x {row['us_per_step'] / anchor:5.2f}" if anchor else ""
-        print(
-            f"N {row['work']:6d} {row['mode']:8s} {row['us_per_step']:9.1f} us/step {ratio:8s}"
-            + (
+        name = f"N {row['work']:6d} {row['mode']:8s}"
+        line = f"{name} {row['us_per_step']:9.1f} us/step {ratio:8s}"
+        if "corrections" in row:
+            line += (
                 f" {row['corrections']:5.1f} corrections, energy {row['energy']:.0e}, "
                 f"levels {row['level']:.0e} {row['rate']:.0e}, error {row['error']:.0e}, "
                 f"{row['bytes_per_link']:.0f} B/link, compile {row['compile_s']:.1f} s"
-                if "corrections" in row
-                else ""
             )
-        )
+        print(line)
     for mode in ("default", "fast"):
         ours = [r for r in rows if r["mode"] == mode and "us_per_correction" in r]
         for one, other in zip(ours, ours[1:], strict=False):

@@ -1,4 +1,4 @@
-"""Systems of many unknowns: the pattern of the Jacobian, the band, and what runs on them."""
+"""Systems of many unknowns: the pattern of the Jacobian, the band, what runs on them."""
 
 import functools
 
