@@ -20,8 +20,8 @@ def max_norm(x: PyTree[Array]) -> Scalar:
 class Newton(eqx.Module):
     """Newton's method on a problem scaled to order one, down to round-off.
 
-    One Jacobian serves several corrections, with an approximate inverse that is improved
-    from that of the step before. It is renewed where the corrections `c_k` would shrink by
+    One Jacobian serves several corrections and steps, with an approximate inverse that is
+    improved from the one before. It is renewed where the corrections `c_k` would shrink by
     less than three; such a correction is not made. Stops after a correction whose error,
     predicted to be `c_k max(c_k / c_{k-1}, c_{k-1})`, is of round-off size, or which was
     computed from a residual that is, or where corrections that did shrink no longer do:
@@ -55,10 +55,15 @@ class Start(eqx.Module):
 class _Iterate(eqx.Module):
     x: Float[Array, " n"]
     factors: AbstractFactors
-    # Size of the last correction, infinite if there was none.
+    # Size of the last correction, infinite if there was none, and what it had left of the
+    # one before, with the same Jacobian.
     size: Scalar
+    contraction: Scalar
     corrections: Count
     jacobians: Count
+    # Whether the factors are of the Jacobian at `x`, and whether they should become so.
+    fresh: Flag
+    stale: Flag
     done: Flag
     broken: Flag
 
@@ -77,75 +82,59 @@ def newton_iterations(
     second, _ = ravel_pytree(start.second_guess)
     eps = float(jnp.finfo(x0.dtype).eps)
 
-    def with_value(x):
-        value = residual(x)
-        return value, value
+    def linearise(carry: _Iterate) -> _Iterate:
+        factors = carry.factors.renewed(jax.jacfwd(residual)(carry.x))
+        return eqx.tree_at(
+            lambda c: (c.factors, c.jacobians, c.fresh, c.stale),
+            carry,
+            (factors, carry.jacobians + 1, jnp.array(True), jnp.array(False)),
+        )
 
-    def corrected(carry: _Iterate, value: Array) -> tuple[_Iterate, Scalar]:
-        """One correction, and what it leaves of the one before."""
-        correction = carry.factors.solve(value)
-        x = carry.x - correction
+    def correct(before: _Iterate) -> _Iterate:
+        before = jax.lax.while_loop(lambda c: c.stale, linearise, before)
+        fresh = before.fresh
+        value = residual(before.x)
+        correction = before.factors.solve(value)
+        x = before.x - correction
         # Each unknown against itself: one scale for all would hide a light, slow body
         # beside a heavy, fast one. The floor is for unknowns that pass through zero.
         size = jnp.max(jnp.abs(correction) / (jnp.abs(x) + eps**0.125), initial=0.0)
-        done = (max_norm(value) <= newton.atol * eps) & (size <= eps**0.25)
-        after = _Iterate(
-            x,
-            carry.factors,
-            size,
-            carry.corrections + 1,
-            carry.jacobians,
-            done,
-            carry.broken,
-        )
-        return after, size / carry.size
-
-    def converging(inner: tuple[_Iterate, Scalar]) -> Flag:
-        carry, contraction = inner
-        return ~carry.done & (contraction < _SHRINKS)
-
-    def chord(inner: tuple[_Iterate, Scalar]) -> tuple[_Iterate, Scalar]:
-        before, _ = inner
-        value = residual(before.x)
-        after, contraction = corrected(before, value)
-        # The contraction of a chord is what its Jacobian is off by: it stays. At least as
-        # much as the last correction moved it, where one that shrinks more is an accident.
+        contraction = size / before.size
         shrinks = contraction < _SHRINKS
-        left = after.size * jnp.maximum(contraction, before.size)
-        converged = shrinks & (left <= newton.rtol * eps)
-        after = eqx.tree_at(lambda c: c.done, after, after.done | converged)
-        kept = shrinks | after.done
-        return jax.tree.map(lambda x, y: jnp.where(kept, x, y), after, before), contraction
-
-    def linearise(carry: _Iterate) -> _Iterate:
-        jacobian, value = jax.jacfwd(with_value, has_aux=True)(carry.x)
-        carry = eqx.tree_at(
-            lambda c: (c.factors, c.jacobians),
-            carry,
-            (carry.factors.renewed(jacobian), carry.jacobians + 1),
-        )
-        carry, contraction = corrected(carry, value)
+        # The contraction of a chord is what its Jacobian is off by: it stays. At least as
+        # much as the last correction moved it, and as it was: where one shrinks more, it
+        # is an accident.
+        rate = jnp.maximum(jnp.maximum(contraction, before.contraction), before.size)
+        converged = ~fresh & shrinks & (size * rate <= newton.rtol * eps)
+        largest = max_norm(value)
+        is_root = (largest <= newton.atol * eps) & (size <= eps**0.25)
         # With a Jacobian of its own a small correction shrinks, unless it is round-off.
-        stalled = (max_norm(value) <= eps**0.75) & (carry.size <= eps**0.25)
-        done = carry.done | (stalled & (contraction >= _SHRINKS))
-        carry = eqx.tree_at(lambda c: c.done, carry, done & jnp.isfinite(carry.size))
-        begin = jnp.where(jnp.isfinite(carry.size), 0.0, jnp.inf).astype(x0.dtype)
-        carry, _ = jax.lax.while_loop(converging, chord, (carry, begin))
-        broken = ~jnp.isfinite(carry.size)
-        lost = broken | (carry.jacobians == _PATIENCE)
-        again = lost & ~carry.done & (carry.jacobians <= _PATIENCE)
-        return eqx.tree_at(
-            lambda c: (c.x, c.size, c.jacobians, c.broken),
-            carry,
-            (
-                jnp.where(again, second, carry.x),
-                jnp.where(again, jnp.inf, carry.size),
-                jnp.where(again, _PATIENCE + 1, carry.jacobians),
-                broken & ~again,
-            ),
+        stalled = fresh & ~shrinks & (largest <= eps**0.75) & (size <= eps**0.25)
+        done = (converged | is_root | stalled) & jnp.isfinite(size)
+        kept = fresh | shrinks | done
+        broken = fresh & ~jnp.isfinite(size)
+        lost = broken | (~kept & (before.jacobians == _PATIENCE))
+        again = lost & (before.jacobians <= _PATIENCE)
+        return _Iterate(
+            jnp.where(again, second, jnp.where(kept, x, before.x)),
+            before.factors,
+            jnp.where(again, jnp.inf, jnp.where(kept, size, before.size)),
+            jnp.where(fresh | again, 0, contraction),
+            before.corrections + kept.astype(before.corrections.dtype),
+            jnp.where(again, _PATIENCE + 1, before.jacobians),
+            jnp.zeros_like(fresh),
+            ~kept | again,
+            done,
+            broken & ~again,
         )
 
-    infinite, none, no = jnp.asarray(jnp.inf, x0.dtype), jnp.array(0), jnp.array(False)
-    first = _Iterate(x0, start.factors, infinite, none, none, start.skip, no)
-    unfinished = lambda c: ~(c.done | c.broken) & (c.jacobians < max_jacobians)
-    return jax.lax.while_loop(unfinished, linearise, first)
+    infinite, zero = jnp.asarray(jnp.inf, x0.dtype), jnp.zeros((), x0.dtype)
+    none, no = jnp.array(0), jnp.array(False)
+    # The Jacobian of the solve before serves as long as it does.
+    first = _Iterate(
+        x0, start.factors, infinite, zero, none, none, no, no, start.skip, no
+    )
+    unfinished = lambda c: (
+        ~(c.done | c.broken) & ~(c.stale & (c.jacobians >= max_jacobians))
+    )
+    return jax.lax.while_loop(unfinished, correct, first)

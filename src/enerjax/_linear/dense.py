@@ -33,7 +33,9 @@ def _inverse_jvp(primals, tangents):
     # Matrix products alone, however often it is differentiated.
     (x,), (dx,) = primals, tangents
     y = inverse(x)
-    return y, -y @ dx @ y
+    if x.shape[0] > SMALL:
+        return y, -y @ dx @ y
+    return y, -_product(_product(y, dx), y)
 
 
 @jax.jit
@@ -81,8 +83,8 @@ class AbstractFactors(eqx.Module):
 
 def empty_factors(size: int, dtype: Any) -> AbstractFactors:
     """Of no matrix yet: the form for its size."""
-    zero = jnp.zeros((size, size), dtype)
-    return Inverse(zero) if size <= SMALL else LU(zero, jnp.arange(size))
+    none = jnp.full((size, size), jnp.nan, dtype)
+    return Inverse(none) if size <= SMALL else LU(none, jnp.arange(size))
 
 
 class Inverse(AbstractFactors):
