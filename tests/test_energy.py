@@ -160,9 +160,10 @@ def test_more_alpha_dissipates_more(name, scheme):
 def test_newton_needs_few_iterations(name, scheme, alpha):
     iterations = run(name, scheme, alpha).stats.newton_iterations
     assert iterations.min() >= 1
-    # Corrections; most share their Jacobian with the one before.
-    assert iterations.max() <= 6
-    assert iterations.mean() <= 3.5
+    # Corrections, of which each leaves less than a third; most share their Jacobian with
+    # those of the steps before.
+    assert iterations.max() <= 16
+    assert iterations.mean() <= 8
 
 
 @functools.cache
