@@ -44,7 +44,7 @@ def _top():
     )
     body = system.CreateRigidBody(
         inertia=inertia,
-        nodeType=exu.NodeType.RotationRotationVector,
+        nodeType=exu.NodeType.RotationEulerParameters,
         referencePosition=[0, 1, 0],
         initialVelocity=[4.61538, 0, 0],
         initialAngularVelocity=[0, 150, -4.61538],
