@@ -51,7 +51,7 @@ def enerjax_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
     def column(k, carry):
         table, free, rows, columns = carry
-        entries = jnp.sum(jnp.where(order == k, table, 0), axis=1)
+        entries = jnp.sum(jnp.where((order == k)[None], table, 0), axis=1)
         sizes = jnp.where(free, jnp.abs(entries), -1)
         # The first of the largest: cheaper as two plain reductions than `argmax`. (Where
         # an entry is not a number there is none, and all becomes so.)
@@ -62,7 +62,7 @@ def enerjax_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
         # The unknown of the column and the right-hand side of the row change places.
         row = jnp.where(order == k, 1, row) / entry
         factors = jnp.where(chosen, 0, entries)
-        kept = jnp.where(order == k, 0, table) - factors[:, None] * row[None]
+        kept = jnp.where((order == k)[None], 0, table) - factors[:, None] * row[None]
         table = jnp.where(chosen[:, None], row[None], kept)
         rows = jnp.where(order == k, pivot, rows)
         return table, free & ~chosen, rows, jnp.where(chosen, k, columns)
