@@ -131,9 +131,7 @@ def newton_iterations(
     infinite, zero = jnp.asarray(jnp.inf, x0.dtype), jnp.zeros((), x0.dtype)
     none, no = jnp.array(0), jnp.array(False)
     # The Jacobian of the solve before serves as long as it does.
-    first = _Iterate(
-        x0, start.factors, infinite, zero, none, none, no, no, start.skip, no
-    )
+    first = _Iterate(x0, start.factors, infinite, zero, none, none, no, no, start.skip, no)
     unfinished = lambda c: (
         ~(c.done | c.broken) & ~(c.stale & (c.jacobians >= max_jacobians))
     )

@@ -5,3 +5,4 @@ from .dense import (
     solve as solve,
 )
 from .dots import plain_products as plain_products
+from .symmetric import cholesky as cholesky, eigh as eigh

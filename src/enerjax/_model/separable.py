@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from .._discrete import AbstractDerivative
 from .._kinematics import IdentityKinematics
+from .._linear import solve
 from .._system import State, System
 from .._types import (
     Args,
@@ -203,3 +204,15 @@ class SeparableModel(AbstractModel):
         right = rows * jnp.concatenate([force, -drift])
         solution = columns * jnp.linalg.solve(scaled, right)
         return solution[: v.size], solution[v.size :]
+
+    def multipliers(self, state: State) -> Multipliers:
+        """By the constraints alone where `L = I`: a smaller matrix."""
+        if not self.has_canonical_rates or self.system.coordinate_constraint is not None:
+            return super().multipliers(state)
+        q, v = state.q, state.v
+        rows = self.constraint_jacobian(q) / self.scales.constraint[:, None]
+        _, drift = jax.jvp(lambda x: self.joint_rate(x, v), (q,), (v,))
+        push = self.inverse_inertia @ jax.grad(self._potential)(q)
+        right = drift / self.scales.constraint - rows @ push
+        mobility = rows @ self.inverse_inertia @ rows.T
+        return solve(mobility, right) / self.scales.constraint
