@@ -74,7 +74,7 @@ def our_rows(sizes: tuple[int, ...]) -> list[harness.Row]:
         solution = program(start, args)
         turnover = float(jnp.sum(args["m"] * args["g"] * jnp.cumsum(args["l"])))
         length = 1 / num_links
-        row = dict(
+        row: harness.Row = dict(
             work=num_links,
             method="EnergyPreserving()",
             steps=steps,

@@ -3,9 +3,10 @@
     python benchmarks/step_cost.py [--out FOLDER]
 
 Each row is a run, whose error is measured first; a wrong answer is reported and not timed.
-Times are medians over interleaved repeats, on one core (the process pins itself), with
-XLA's default settings and with `enable_fast_loops()` (two processes). The pendulum is
-released from the horizontal, two unit rods and masses; the top is `problems.heavy_top`.
+Times are medians over interleaved repeats, of the processor (so that other processes do
+not count) on one core (the process pins itself), with XLA's default settings and with
+`enable_fast_loops()` (two processes). The pendulum is released from the horizontal, two
+unit rods and masses; the top is `problems.heavy_top`.
 EXUDYN (the extra `peers`) runs the generalized-alpha method, rho 0.9, in the same Cartesian
 coordinates. Writes step_cost.json and step_cost.png.
 """
@@ -89,9 +90,9 @@ def our_runs(exact: dict[str, list[float]]) -> list[dict]:
                     system, scheme, start, args, h=h, num_steps=steps, save_every=steps
                 )
 
-            begin = time.perf_counter()
+            begin = time.process_time()
             program = jax.jit(run).lower(start, args, h).compile()
-            seconds = time.perf_counter() - begin
+            seconds = time.process_time() - begin
             solution = program(start, args, h)
             position = np.asarray(solution.ys.q[-1])[: len(exact[work])]
             error = float(np.max(np.abs(position - exact[work])))
@@ -110,9 +111,9 @@ def our_runs(exact: dict[str, list[float]]) -> list[dict]:
     times: list[list[float]] = [[] for _ in timed]
     for _ in range(REPEATS):
         for program, record in zip(programs, times, strict=True):
-            begin = time.perf_counter()
+            begin = time.process_time()
             jax.block_until_ready(program())
-            record.append(time.perf_counter() - begin)
+            record.append(time.process_time() - begin)
     for row, record in zip(timed, times, strict=True):
         row["us_per_step"] = 1e6 * statistics.median(record) / row["steps"]
     return rows

@@ -86,7 +86,7 @@ def test_a_shuffled_band_is_found_and_solved(size):
     matrix, right = _banded(size, rng), rng.normal(size=size)
     band = Band(csr_array(matrix != 0))
     assert band.width <= 12
-    entries, _ = band.evaluate(lambda x: jnp.asarray(matrix) @ x, jnp.zeros(size))
+    entries = band.evaluate(lambda x: jnp.asarray(matrix) @ x, jnp.zeros(size))
     factors = BandFactors.empty(band, float).renewed(entries)
     x = factors.solve(jnp.asarray(right))
     bound = 1e3 * size * EPS * np.abs(matrix).max()  # round-off
@@ -215,10 +215,13 @@ def test_lanes_of_chains_move_alone():
 
 def test_repeated_constraints_of_a_large_system_are_reported():
     system, start, args = ej.problems.chain(300)
+    assert isinstance(system, ej.System)
+    assert system.constraint is not None
+    once = system.constraint
     twice = ej.System(
         system.kinetic,
         system.potential,
-        lambda q, args: jnp.concatenate([system.constraint(q, args)] * 2),
+        lambda q, args: jnp.concatenate([once(q, args)] * 2),
     )
     with pytest.raises(ValueError, match="do not determine their multipliers"):
         ej.initial_state(twice, start.q, start.v, args)

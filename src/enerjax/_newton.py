@@ -53,14 +53,17 @@ class Start(eqx.Module):
 class _Iterate(eqx.Module):
     x: Float[Array, " n"]
     factors: AbstractFactors
-    # Size of the last correction, infinite if there was none.
+    # Size of the last correction, infinite if there was none, and what it had left of the
+    # one before, zero unless both were made with the same Jacobian.
     size: Scalar
-    # Size of the residual that it was made from.
-    defect: Scalar
+    contraction: Scalar
     corrections: Count
     jacobians: Count
     # Jacobians in a row after which the correction was small and did not shrink.
     stalls: Count
+    # Whether the factors are of the Jacobian at `x`, and whether they should become so.
+    fresh: Flag
+    stale: Flag
     done: Flag
     broken: Flag
 
@@ -68,7 +71,9 @@ class _Iterate(eqx.Module):
 # Jacobians after which a first guess is given up. Where quadratic convergence sets in at
 # all, it does so before.
 _PATIENCE = 12
-# What a correction may leave of the one before, for its Jacobian to serve on.
+# What a correction may leave of the one before, for its Jacobian to serve on. That of the
+# step before is not used: it leaves an error of round-off size, but of one sign, and the
+# energy would drift.
 _SHRINKS = 0.3
 _STALLS = 4
 
@@ -80,84 +85,65 @@ def newton_iterations(
     second, _ = ravel_pytree(start.second_guess)
     eps = float(jnp.finfo(x0.dtype).eps)
 
-    def corrected(carry: _Iterate, value: Array) -> tuple[_Iterate, Scalar]:
-        """One correction, and what it leaves of the one before."""
-        correction = carry.factors.solve(value)
-        x = carry.x - correction
+    def linearise(carry: _Iterate) -> _Iterate:
+        factors = carry.factors.renewed(residual.jacobian(carry.x))
+        return eqx.tree_at(
+            lambda c: (c.factors, c.jacobians, c.fresh, c.stale),
+            carry,
+            (factors, carry.jacobians + 1, jnp.array(True), jnp.array(False)),
+        )
+
+    def correct(before: _Iterate) -> _Iterate:
+        before = jax.lax.while_loop(lambda c: c.stale, linearise, before)
+        fresh = before.fresh
+        value = residual.value(before.x)
+        correction = before.factors.solve(value)
+        x = before.x - correction
         # Each unknown against itself: one scale for all would hide a light, slow body
         # beside a heavy, fast one. The floor is for unknowns that pass through zero.
         size = jnp.max(jnp.abs(correction) / (jnp.abs(x) + eps**0.125), initial=0.0)
-        defect = max_norm(value)
-        done = (defect <= newton.atol * eps) & (size <= eps**0.25)
-        after = _Iterate(
-            x,
-            carry.factors,
-            size,
-            defect,
-            carry.corrections + 1,
-            carry.jacobians,
-            carry.stalls,
-            done,
-            carry.broken,
-        )
-        return after, size / carry.size
-
-    def converging(inner: tuple[_Iterate, Scalar]) -> Flag:
-        carry, contraction = inner
-        return ~carry.done & (contraction < _SHRINKS)
-
-    def chord(inner: tuple[_Iterate, Scalar]) -> tuple[_Iterate, Scalar]:
-        before, rate = inner
-        value = residual.value(before.x)
-        after, contraction = corrected(before, value)
-        # The contraction of a chord is what its Jacobian is off by: it stays. At least as
-        # much as the last correction moved it, where one that shrinks more is an accident.
+        defect, contraction = max_norm(value), size / before.size
+        small = size <= eps**0.25
         shrinks = contraction < _SHRINKS
-        left = after.size * jnp.maximum(contraction, before.size)
-        converged = shrinks & (left <= newton.rtol * eps)
-        # One that shrank and no longer does has met the round-off.
-        tiny = (after.defect <= eps**0.875) & (after.size <= eps**0.25)
-        stalled = ~shrinks & (rate > 0) & tiny
-        kept = shrinks | after.done
-        carry = jax.tree.map(lambda x, y: jnp.where(kept, x, y), after, before)
-        done = after.done | converged | stalled
-        return eqx.tree_at(lambda c: c.done, carry, done), contraction
-
-    def linearise(carry: _Iterate) -> _Iterate:
-        jacobian, value = residual.jacobian(carry.x)
-        carry = eqx.tree_at(
-            lambda c: (c.factors, c.jacobians),
-            carry,
-            (carry.factors.renewed(jacobian), carry.jacobians + 1),
-        )
-        carry, contraction = corrected(carry, value)
-        # With a Jacobian of its own a small correction shrinks, unless it is round-off.
-        # Where the residual is not tiny (coordinates a million lengths off) it must have
-        # happened several times to be believed.
-        stalled = (carry.size <= eps**0.25) & (contraction >= _SHRINKS)
-        stalls = jnp.where(stalled, carry.stalls + 1, 0)
-        carry = eqx.tree_at(lambda c: c.stalls, carry, stalls)
-        done = carry.done | (stalled & (carry.defect <= eps**0.75)) | (stalls == _STALLS)
-        carry = eqx.tree_at(lambda c: c.done, carry, done & jnp.isfinite(carry.size))
-        # No contraction is known of this Jacobian yet.
-        begin = jnp.where(jnp.isfinite(carry.size), 0.0, jnp.inf).astype(x0.dtype)
-        carry, _ = jax.lax.while_loop(converging, chord, (carry, begin))
-        broken = ~jnp.isfinite(carry.size)
-        lost = broken | (carry.jacobians == _PATIENCE)
-        again = lost & ~carry.done & (carry.jacobians <= _PATIENCE)
-        return eqx.tree_at(
-            lambda c: (c.x, c.size, c.jacobians, c.broken),
-            carry,
-            (
-                jnp.where(again, second, carry.x),
-                jnp.where(again, jnp.inf, carry.size),
-                jnp.where(again, _PATIENCE + 1, carry.jacobians),
-                broken & ~again,
-            ),
+        # The contraction of a chord is what its Jacobian is off by: it stays. At least as
+        # much as the last correction moved it, and as it was: where one shrinks more, it
+        # is an accident.
+        rate = jnp.maximum(jnp.maximum(contraction, before.contraction), before.size)
+        converged = (size * rate <= newton.rtol * eps) & (defect <= eps**0.25)
+        converged = ~fresh & shrinks & converged
+        is_root = (defect <= newton.atol * eps) & small
+        # One that shrank, with this Jacobian, and no longer does has met the round-off.
+        ends = ~fresh & ~shrinks & (before.contraction > 0)
+        ends = ends & (defect <= eps**0.875) & small
+        # So has one with a Jacobian of its own; but where the residual is not tiny
+        # (coordinates a million lengths off) only if it happens again and again.
+        stalled = fresh & ~shrinks & small
+        stalls = jnp.where(fresh, jnp.where(stalled, before.stalls + 1, 0), before.stalls)
+        ends = ends | (stalled & ((defect <= eps**0.75) | (stalls == _STALLS)))
+        done = (converged | is_root | ends) & jnp.isfinite(size)
+        kept = fresh | shrinks | is_root
+        broken = fresh & ~jnp.isfinite(size)
+        lost = broken | (~kept & (before.jacobians == _PATIENCE))
+        again = lost & ~done & (before.jacobians <= _PATIENCE)
+        return _Iterate(
+            jnp.where(again, second, jnp.where(kept, x, before.x)),
+            before.factors,
+            jnp.where(again, jnp.inf, jnp.where(kept, size, before.size)),
+            jnp.where(fresh | again, 0, contraction),
+            before.corrections + kept.astype(before.corrections.dtype),
+            jnp.where(again, _PATIENCE + 1, before.jacobians),
+            stalls,
+            jnp.zeros_like(fresh),
+            ~kept | again,
+            done,
+            broken & ~again,
         )
 
-    infinite, none, no = jnp.asarray(jnp.inf, x0.dtype), jnp.array(0), jnp.array(False)
-    factors = residual.no_factors(start.factors, x0)
-    first = _Iterate(x0, factors, infinite, infinite, none, none, none, start.skip, no)
-    unfinished = lambda c: ~(c.done | c.broken) & (c.jacobians < max_jacobians)
-    return jax.lax.while_loop(unfinished, linearise, first)
+    infinite, zero = jnp.asarray(jnp.inf, x0.dtype), jnp.zeros((), x0.dtype)
+    none, no = jnp.array(0), jnp.array(False)
+    factors, yes = residual.first_factors(start.factors, x0), jnp.array(True)
+    first = _Iterate(x0, factors, infinite, zero, none, none, none, no, yes, start.skip, no)
+    unfinished = lambda c: (
+        ~(c.done | c.broken) & ~(c.stale & (c.jacobians >= max_jacobians))
+    )
+    return jax.lax.while_loop(unfinished, correct, first)

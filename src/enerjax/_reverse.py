@@ -60,4 +60,5 @@ def _in_segments(
     live = jnp.append(live, jnp.zeros((-length % size,), bool)).reshape(-1, size)
     segment = keep(lambda carry, live: jax.lax.scan(body, carry, live))
     carry, out = jax.lax.scan(segment, carry, live)
-    return carry, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:length], out)
+    join = lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:])[:length]
+    return carry, jax.tree.map(join, out)

@@ -1,12 +1,17 @@
 from .blocks import (
     as_dense as as_dense,
+    BlockDiagonal as BlockDiagonal,
     blocks_of as blocks_of,
     hessian as hessian,
     in_blocks as in_blocks,
     inverse_of as inverse_of,
     Symmetric as Symmetric,
 )
-from .dense import AbstractFactors as AbstractFactors, inverse as inverse
+from .dense import (
+    AbstractFactors as AbstractFactors,
+    inverse as inverse,
+    solve as solve,
+)
 from .jacobian import (
     affine_root as affine_root,
     jacobian_rows as jacobian_rows,
@@ -14,3 +19,4 @@ from .jacobian import (
     Linearisable as Linearisable,
     linearisable as linearisable,
 )
+from .symmetric import cholesky as cholesky, eigh as eigh

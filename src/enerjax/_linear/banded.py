@@ -58,9 +58,9 @@ class Band:
 
     def evaluate(
         self, fn: Callable[[Array], Array], x: Float[Array, " n"]
-    ) -> tuple[Float[Array, "blocks width three_widths"], Float[Array, " n"]]:
-        """The band of the Jacobian of `fn` at `x`, and the value."""
-        value, products = coloured_products(fn, x, self.colours)
+    ) -> Float[Array, "blocks width three_widths"]:
+        """The band of the Jacobian of `fn` at `x`."""
+        products = coloured_products(fn, x, self.colours)
         entries = jnp.append(products.ravel(), 0)
         band = entries[self.places]
         # Rows that only fill up the last block.
@@ -68,17 +68,16 @@ class Band:
         for k in range(self.size, self.num_blocks * self.width):
             block, row = divmod(k, self.width)
             full[block, row, self.width + row] = 1
-        return band + jnp.asarray(full, x.dtype), value
+        return band + jnp.asarray(full, x.dtype)
 
 
 def coloured_products(
     fn: Callable[[Array], Array], x: Float[Array, " n"], colours: np.ndarray
-) -> tuple[Float[Array, " m"], Float[Array, "colours m"]]:
-    """The value, and for each colour the sum of the columns that have it."""
+) -> Float[Array, "colours m"]:
+    """For each colour the sum of the columns that have it."""
     numbers = jnp.arange(int(colours.max(initial=0)) + 1)
     seeds = (numbers[:, None] == jnp.asarray(colours)[None, :]).astype(x.dtype)
-    push = lambda seed: jax.jvp(fn, (x,), (seed,))
-    return jax.vmap(push, out_axes=(None, 0))(seeds)
+    return jax.vmap(lambda seed: jax.jvp(fn, (x,), (seed,))[1])(seeds)
 
 
 def column_colours(pattern: csr_array, order: np.ndarray) -> np.ndarray:

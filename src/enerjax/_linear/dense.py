@@ -18,8 +18,8 @@ from .._types import Flag, Scalar
 
 # Rows up to which plain operations beat LAPACK.
 SMALL = 32
-# Rows up to which the elimination is written out column by column.
-_UNROLLED = 10
+# Rows up to which the elimination is written out: it compiles slowly.
+_UNROLLED = 3
 
 
 @jax.custom_jvp
@@ -33,38 +33,48 @@ def _inverse_jvp(primals, tangents):
     # Matrix products alone, however often it is differentiated.
     (x,), (dx,) = primals, tangents
     y = inverse(x)
-    return y, -y @ dx @ y
+    if x.shape[0] > SMALL:
+        return y, -y @ dx @ y
+    return y, -_product(_product(y, dx), y)
 
 
 @jax.jit
 def enerjax_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """By Gauss-Jordan elimination with row pivoting; rows are chosen, not exchanged.
+    """By Gauss-Jordan elimination in place with row pivoting; rows are not exchanged.
 
     The discrete derivative knows it by its name.
     """
-    if matrix.shape[0] > SMALL:
-        return jnp.linalg.inv(matrix)
     size = matrix.shape[0]
-    rows = jnp.concatenate([matrix, jnp.eye(size, dtype=matrix.dtype)], axis=1)
+    if size > SMALL:
+        return jnp.linalg.inv(matrix)
     order = jnp.arange(size)
 
     def column(k, carry):
-        rows, free, places = carry
-        candidates = jnp.where(free, jnp.abs(rows[:, k]), -1)
-        pivot = jnp.argmax(candidates)
+        table, free, rows, columns = carry
+        entries = jnp.sum(jnp.where((order == k)[None], table, 0), axis=1)
+        sizes = jnp.where(free, jnp.abs(entries), -1)
+        # The first of the largest: cheaper as two plain reductions than `argmax`. (Where
+        # an entry is not a number there is none, and all becomes so.)
+        pivot = jnp.min(jnp.where(sizes == jnp.max(sizes), order, size))
         chosen = order == pivot
-        row = rows[pivot] / rows[pivot, k]
-        factors = jnp.where(chosen, 0, rows[:, k])
-        rows = jnp.where(chosen[:, None], row[None], rows - factors[:, None] * row[None])
-        return rows, free & ~chosen, jnp.where(order == k, pivot, places)
+        row = jnp.sum(jnp.where(chosen[:, None], table, 0), axis=0)
+        entry = jnp.sum(jnp.where(chosen, entries, 0))
+        # The unknown of the column and the right-hand side of the row change places.
+        row = jnp.where(order == k, 1, row) / entry
+        factors = jnp.where(chosen, 0, entries)
+        kept = jnp.where((order == k)[None], 0, table) - factors[:, None] * row[None]
+        table = jnp.where(chosen[:, None], row[None], kept)
+        rows = jnp.where(order == k, pivot, rows)
+        return table, free & ~chosen, rows, jnp.where(chosen, k, columns)
 
-    carry = rows, jnp.ones((size,), bool), jnp.zeros((size,), order.dtype)
+    none = jnp.zeros((size,), order.dtype)
+    carry = matrix, jnp.ones((size,), bool), none, none
     if size <= _UNROLLED:
         carry = functools.reduce(lambda c, k: column(k, c), range(size), carry)
     else:
         carry = jax.lax.fori_loop(0, size, column, carry)
-    rows, _, places = carry
-    return rows[places, size:]
+    table, _, rows, columns = carry
+    return table[rows][:, columns]
 
 
 class AbstractFactors(eqx.Module):
@@ -91,7 +101,8 @@ class Inverse(AbstractFactors):
 
     @classmethod
     def empty(cls, size: int, dtype: Any) -> "Inverse":
-        return cls(jnp.zeros((size, size), dtype))
+        """Of no matrix yet: corrects nothing, and is renewed."""
+        return cls(jnp.full((size, size), jnp.nan, dtype))
 
     def renewed(self, matrix: Float[Array, "n n"]) -> "Inverse":
         defect = jnp.eye(matrix.shape[0], dtype=matrix.dtype) - _product(

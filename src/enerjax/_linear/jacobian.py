@@ -30,30 +30,25 @@ class Linearisable(eqx.Module):
     value: Callable[[Float[Array, " n"]], Float[Array, " n"]]
     band: Band | None
 
-    def jacobian(self, x: Float[Array, " n"]) -> tuple[Array, Float[Array, " n"]]:
-        """The Jacobian, for `factors`, and the value."""
+    def jacobian(self, x: Float[Array, " n"]) -> Array:
+        """The Jacobian, in the form that `first_factors` are renewed with."""
         if self.band is not None:
             return self.band.evaluate(self.value, x)
+        return jax.jacfwd(self.value)(x)
 
-        def with_value(x):
-            value = self.value(x)
-            return value, value
-
-        return jax.jacfwd(with_value, has_aux=True)(x)
-
-    def no_factors(
-        self, like: AbstractFactors | None, x: Float[Array, " n"]
+    def first_factors(
+        self, kept: AbstractFactors | None, x: Float[Array, " n"]
     ) -> AbstractFactors:
-        """Where an iteration begins: with those of a problem before, where they help."""
-        if isinstance(like, Inverse):
-            return like
+        """What the first Jacobian of an iteration renews."""
+        if kept is not None:
+            return kept
         if self.band is not None:
             return BandFactors.empty(self.band, x.dtype)
         return LU.empty(x.size, x.dtype)
 
     def solve(self, x: Float[Array, " n"], right: Float[Array, " n"]) -> Array:
         """`J(x)^-1 right`, differentiable in all there is, and transposable in `right`."""
-        matrix, _ = self.jacobian(x)
+        matrix = self.jacobian(x)
         if self.band is None:
             return solve(matrix, right)
         factors = BandFactors.empty(self.band, x.dtype).renewed(matrix)
@@ -92,7 +87,7 @@ def affine_root(
     at = jnp.zeros_like(like)
     linear = linearisable(lambda x, _: fn(x), at, None)
     if linear.band is None:
-        return -jnp.linalg.solve(*linear.jacobian(at))
+        return -jnp.linalg.solve(linear.jacobian(at), linear.value(at))
     return -linear.solve(at, linear.value(at))
 
 
@@ -106,7 +101,7 @@ def jacobian_rows(
         return jax.jacfwd(fn)(x), columns
     pattern = jacobian_pattern(lambda x: fn(x), x)
     colours = column_colours(pattern, np.arange(x.size))
-    products = coloured_products(fn, x, colours)[1]
+    products = coloured_products(fn, x, colours)
     counts = np.diff(pattern.indptr)
     rows = np.repeat(np.arange(num_rows), counts)
     within = np.arange(rows.size) - np.repeat(pattern.indptr[:-1], counts)

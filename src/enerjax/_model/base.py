@@ -158,6 +158,10 @@ class AbstractModel(eqx.Module):
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
         """`vdot` (or `pdot`) and `lambda` that satisfy the equations of motion."""
 
+    def multipliers(self, state: State) -> Multipliers:
+        """The `lambda` of `accelerations` alone."""
+        return self.accelerations(state)[1]
+
     def joint(self, q: Coordinates) -> JointMultipliers:
         """The constraints that are held at velocity level too."""
         if self.system.constraint is None:

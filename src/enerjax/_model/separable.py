@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from .._discrete import AbstractDerivative
 from .._kinematics import IdentityKinematics
-from .._linear import affine_root, as_dense, inverse_of, Symmetric
+from .._linear import affine_root, as_dense, inverse_of, solve, Symmetric
 from .._system import State, System
 from .._types import (
     Args,
@@ -200,3 +200,16 @@ class SeparableModel(AbstractModel):
 
         x = affine_root(conditions, jnp.zeros((v.size + scales.constraint.size,), q.dtype))
         return unit * x[: v.size], x[v.size :] / scales.constraint
+
+    def multipliers(self, state: State) -> Multipliers:
+        """By the constraints alone where `L = I`: a smaller matrix."""
+        inverse_inertia = self.inverse_inertia
+        if not self.has_canonical_rates or not isinstance(inverse_inertia, Array):
+            return super().multipliers(state)
+        q, v = state.q, state.v
+        rows = jax.jacfwd(self.constraint)(q) / self.scales.constraint[:, None]
+        _, drift = jax.jvp(lambda x: self.joint_rate(x, v), (q,), (v,))
+        push = inverse_inertia @ jax.grad(self._potential)(q)
+        right = drift / self.scales.constraint - rows @ push
+        mobility = rows @ inverse_inertia @ rows.T
+        return solve(mobility, right) / self.scales.constraint

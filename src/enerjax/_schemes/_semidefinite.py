@@ -4,20 +4,22 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._linear import cholesky, eigh, inverse
+
 
 def semidefinite_part(
     stiffness: Float[Array, "nq nq"], inertia: Float[Array, "nq nq"]
 ) -> Float[Array, "nq nq"]:
     """Positive semidefinite part in the metric of the inertia: independent of units."""
-    root = jnp.linalg.cholesky(inertia)
-    half = jax.scipy.linalg.solve_triangular(root, stiffness, lower=True)
-    whole = jax.scipy.linalg.solve_triangular(root, half.T, lower=True)
+    root = cholesky(inertia)
+    back = inverse(root)
+    whole = back @ stiffness @ back.T
     return root @ _positive_part(0.5 * (whole + whole.T)) @ root.T
 
 
 @jax.custom_jvp
 def _positive_part(x: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    values, vectors = jnp.linalg.eigh(x)
+    values, vectors = eigh(x)
     return (vectors * jnp.maximum(values, 0)[None, :]) @ vectors.T
 
 
@@ -26,7 +28,7 @@ def _positive_part_jvp(primals, tangents):
     # The derivative of a matrix function by divided differences (Daleckii and Krein):
     # bounded where eigenvalues meet, unlike the derivatives of the eigenvectors.
     (x,), (dx,) = primals, tangents
-    values, vectors = jnp.linalg.eigh(x)
+    values, vectors = eigh(x)
     positive = jnp.maximum(values, 0)
     rows, columns = values[:, None], values[None, :]
     mixed = (rows > 0) != (columns > 0)

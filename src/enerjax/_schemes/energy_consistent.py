@@ -5,6 +5,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._discrete import AbstractDerivative, MeanValue
+from .._linear import inverse
 from .._model import AbstractModel, CanonicalModel, Drive, Increment, SeparableModel
 from .._results import RESULTS
 from .._system import State
@@ -116,17 +117,17 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
         # P only has to be semidefinite and near the stiffness for the law and the order,
         # so the multipliers of the start serve. Inside the solve it would cost an
         # eigenvalue problem per iteration.
-        _, multipliers = model.accelerations(start)
+        multipliers = model.multipliers(start)
         middle = State(start.q + 0.5 * h * model.lift(start.q, start.v), start.v)
         stiffness, inertia = model.stiffness(middle, multipliers)
         stiffness = semidefinite_part(stiffness, inertia)
         lag = self._alpha(h) * h / 6
-        jump = jnp.linalg.solve(inertia + lag**2 * stiffness, h / 6 * stiffness)
+        jump = inverse(inertia + lag**2 * stiffness) @ (h / 6 * stiffness)
         if isinstance(model, SeparableModel):
             compliance = jnp.zeros((0, 0), h.dtype)
-            damping = jnp.linalg.inv(jnp.eye(start.q.size, dtype=h.dtype) + lag * jump)
+            damping = inverse(jnp.eye(start.q.size, dtype=h.dtype) + lag * jump)
         else:
-            compliance = jnp.linalg.inv(inertia)
+            compliance = inverse(inertia)
             damping = jnp.zeros((0, 0), h.dtype)
         return _Frozen(step, stiffness, inertia, compliance, jump, damping)
 

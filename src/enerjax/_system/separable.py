@@ -9,7 +9,7 @@ from .._kinematics import (
     ConfigurationKinematics,
     IdentityKinematics,
 )
-from .._linear import hessian, in_blocks, Symmetric
+from .._linear import BlockDiagonal, hessian, in_blocks, Symmetric
 from .._types import Args, Coordinates, Multipliers, Scalar, Velocities
 from .base import AbstractSystem, check_function, inexact, State
 from .canonical import HamiltonianSystem, LagrangianSystem
@@ -48,7 +48,7 @@ class System(AbstractSystem):
 
     def __init__(
         self,
-        kinetic: Callable[[Velocities, Args], Scalar] | ArrayLike,
+        kinetic: Callable[[Velocities, Args], Scalar] | ArrayLike | BlockDiagonal,
         potential: Callable[[Coordinates, Args], Scalar],
         constraint: Callable[[Coordinates, Args], Multipliers] | None = None,
         *,
@@ -69,7 +69,9 @@ class System(AbstractSystem):
                 "coordinates is an ordinary constraint. Pass it in `constraint`, or "
                 "give `kinematics`."
             )
-        self.kinetic = kinetic if callable(kinetic) else in_blocks(inexact(kinetic))
+        if not (callable(kinetic) or isinstance(kinetic, BlockDiagonal)):
+            kinetic = in_blocks(inexact(kinetic))
+        self.kinetic = kinetic
         self.potential = potential
         self.constraint = constraint
         self.coordinate_constraint = coordinate_constraint
