@@ -130,7 +130,7 @@ def power(values: list[Value], params: dict[str, Any]) -> list[Value]:
     if any(isinstance(v, Switching) for v in values):
         raise NoRule
     if moves(y):
-        return rewritten(lambda x, y: jnp.exp(y * jnp.log(x)))(values, params)
+        return _moving_exponent(values, params)
     quotient = lambda a, b: elementary.pow(a, b, jnp.asarray(y, a.dtype))
     if jnp.ndim(y) == 0 and is_known(y):
         twice = 2 * float(y)
@@ -143,6 +143,17 @@ def power(values: list[Value], params: dict[str, Any]) -> list[Value]:
             )
     ((a, b),) = both(values, params)
     return [Moving(a, b, quotient(x.a, x.b) * x.d)]
+
+
+def _moving_exponent(values: list[Value], params: dict[str, Any]) -> list[Value]:
+    """`exp(y log x)`, with the values of the power itself: they have more digits."""
+    x, y = values
+    ((a, b),) = both(values, params)
+    (xa, ya), (xb, yb) = map(at_a, values), map(at_b, values)
+    rate, mean_log = elementary.log(xa, xb), 0.5 * (jnp.log(xa) + jnp.log(xb))
+    logarithm = lambda dx, dy: 0.5 * (ya + yb) * rate * dx + mean_log * dy
+    quotient = elementary.exp_of(logarithm(xb - xa, yb - ya), a, b)
+    return [Moving(a, b, quotient * logarithm(increment(x), increment(y)))]
 
 
 def absolute(values: list[Value], params: dict[str, Any]) -> list[Value]:

@@ -48,6 +48,12 @@ def exp(a: Array, b: Array) -> Array:
     return _split(b - a, lambda d: mean * _sinhc(0.5 * d), jnp.exp(b) - jnp.exp(a))
 
 
+def exp_of(change: Array, a: Array, b: Array) -> Array:
+    """Of the exponential, from the change of its argument and its two values."""
+    mean = jnp.sqrt(a) * jnp.sqrt(b)
+    return _split(change, lambda d: mean * _sinhc(0.5 * d), b - a)
+
+
 def exp2(a: Array, b: Array) -> Array:
     rate = math.log(2)
     return rate * exp(rate * a, rate * b)

@@ -158,9 +158,9 @@ class AbstractModel(eqx.Module):
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
         """`vdot` (or `pdot`) and `lambda` that satisfy the equations of motion."""
 
+    @abc.abstractmethod
     def multipliers(self, state: State) -> Multipliers:
-        """The `lambda` of `accelerations` alone."""
-        return self.accelerations(state)[1]
+        """`lambda` alone, of `accelerations`."""
 
     def joint(self, q: Coordinates) -> JointMultipliers:
         """The constraints that are held at velocity level too."""

@@ -131,3 +131,6 @@ class CanonicalModel(AbstractModel):
         matrix = unit[:, None] * (rates @ jacobian.T) * unit[None, :]
         multipliers = unit * jnp.linalg.solve(matrix, unit * change)
         return -force - multipliers @ jacobian, multipliers
+
+    def multipliers(self, state: State) -> Multipliers:
+        return self.accelerations(state)[1]

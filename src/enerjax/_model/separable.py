@@ -205,7 +205,7 @@ class SeparableModel(AbstractModel):
         """By the constraints alone where `L = I`: a smaller matrix."""
         inverse_inertia = self.inverse_inertia
         if not self.has_canonical_rates or not isinstance(inverse_inertia, Array):
-            return super().multipliers(state)
+            return self.accelerations(state)[1]
         q, v = state.q, state.v
         rows = jax.jacfwd(self.constraint)(q) / self.scales.constraint[:, None]
         _, drift = jax.jvp(lambda x: self.joint_rate(x, v), (q,), (v,))
