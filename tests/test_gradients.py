@@ -113,7 +113,7 @@ def test_saving_less_does_not_change_the_gradient(steps, long, monkeypatch):
         # Four unknowns a step: 8 bytes each, and the rest for the states in a segment.
         (1000, 12 * 4 * 1000),
         # 10^3 segments, whose starts hold what Newton needs to begin.
-        (1_000_000, 2_000_000),
+        pytest.param(1_000_000, 2_000_000, marks=pytest.mark.slow),
     ],
 )
 def test_memory_of_the_reverse_pass(steps, limit):

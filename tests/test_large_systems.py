@@ -123,7 +123,9 @@ def _chain(scheme):
     return ej.simulate(system, SCHEMES[scheme](0.5), start, args, h=2e-3, num_steps=20)
 
 
-@pytest.mark.parametrize("scheme", ["preserving", "decaying"])
+@pytest.mark.parametrize(
+    "scheme", ["preserving", pytest.param("decaying", marks=pytest.mark.slow)]
+)
 def test_a_chain_moves_as_with_a_dense_solver(scheme):
     system, start, args = ej.problems.chain(NUM_LINKS)
     dense = ej.simulate(
