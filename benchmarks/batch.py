@@ -87,7 +87,7 @@ def accelerations(q: jax.Array, v: jax.Array, m: jax.Array) -> jax.Array:
 
 def diffrax_run(steps: int) -> Callable | None:
     try:
-        import diffrax
+        import diffrax  # pyright: ignore[reportMissingImports]
     except ImportError:
         print("diffrax is not installed (extra `peers`): no rows to compare with")
         return None
