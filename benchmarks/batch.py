@@ -226,17 +226,5 @@ def draw(rows: list[harness.Row], path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
-def main() -> None:
-    options = harness.options("Ten thousand double pendulums at once.")
-    harness.pin()
-    if options.mode is not None:
-        harness.enter(options.mode)
-        harness.hand_over(rows_of(options.quick))
-        return
-    rows = harness.children(__file__, options.quick)
-    show(rows)
-    draw(rows, harness.write(rows, options.out, "batch"))
-
-
 if __name__ == "__main__":
-    main()
+    harness.run(__file__, rows_of, show, draw)

@@ -15,7 +15,6 @@ medians over interleaved repeats, on one core, with XLA's default settings and w
 from pathlib import Path
 
 import harness
-import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -25,9 +24,8 @@ import enerjax as ej
 
 
 H = 1e-3
-SIZES, QUICK_SIZES = (8, 64, 512, 2000, 10000), (8, 64)
-# Steps of a run, and largest errors of a right answer: of the energy against what all
-# points could fall, of the rods against their length, and of positions.
+# Sizes and steps of their runs, and largest errors of a right answer: of the energy
+# against what all points could fall, of the rods against their length, of positions.
 STEPS = {8: 100, 64: 100, 512: 100, 2000: 30, 10000: 10}
 ENERGY_BOUND, LEVEL_BOUND, ERROR_BOUND = 1e-11, 1e-9, 1e-3
 WITH_REFERENCE = 512
@@ -58,9 +56,13 @@ def reference(num_links: int, end: float) -> np.ndarray:
     return run.y[: 2 * num_links, -1]
 
 
-def our_rows(sizes: tuple[int, ...]) -> list[harness.Row]:
+def sizes(quick: bool) -> tuple[int, ...]:
+    return (8, 64) if quick else tuple(STEPS)
+
+
+def our_rows(quick: bool) -> list[harness.Row]:
     rows, programs = [], []
-    for num_links in sizes:
+    for num_links in sizes(quick):
         system, start, args = ej.problems.chain(num_links)
         steps = STEPS[num_links]
 
@@ -106,7 +108,7 @@ def our_rows(sizes: tuple[int, ...]) -> list[harness.Row]:
     return [row | harness.device() for row in rows]
 
 
-def exudyn_rows(sizes: tuple[int, ...]) -> list[harness.Row]:
+def exudyn_rows(quick: bool) -> list[harness.Row]:
     try:
         from chain_exudyn import us_per_step
     except ImportError:
@@ -120,7 +122,7 @@ def exudyn_rows(sizes: tuple[int, ...]) -> list[harness.Row]:
             steps=STEPS[n],
             us_per_step=us_per_step(n, H, STEPS[n]),
         )
-        for n in sizes
+        for n in sizes(quick)
         if n <= 2000
     ]
 
@@ -162,19 +164,5 @@ def draw(rows: list[harness.Row], path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
-def main() -> None:
-    options = harness.options("How the cost of a step grows with the number of bodies.")
-    harness.pin()
-    sizes = QUICK_SIZES if options.quick else SIZES
-    if options.mode is not None:
-        harness.enter(options.mode)
-        harness.hand_over(our_rows(sizes))
-        return
-    jax.config.update("jax_enable_x64", True)
-    rows = exudyn_rows(sizes) + harness.children(__file__, options.quick)
-    show(rows)
-    draw(rows, harness.write(rows, options.out, "chain"))
-
-
 if __name__ == "__main__":
-    main()
+    harness.run(__file__, our_rows, show, draw, exudyn_rows)

@@ -165,17 +165,5 @@ def draw(rows: list[harness.Row], path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
-def main() -> None:
-    options = harness.options("What a derivative costs.")
-    harness.pin()
-    if options.mode is not None:
-        harness.enter(options.mode)
-        harness.hand_over(our_rows(options.quick))
-        return
-    rows = harness.children(__file__, options.quick)
-    show(rows)
-    draw(rows, harness.write(rows, options.out, "gradient"))
-
-
 if __name__ == "__main__":
-    main()
+    harness.run(__file__, our_rows, show, draw)

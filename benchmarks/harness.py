@@ -23,32 +23,51 @@ import enerjax as ej
 Row = dict[str, Any]
 
 
-def options(description: str) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=description)
+def run(
+    script: str,
+    rows_of: Callable[[bool], list[Row]],
+    show: Callable[[list[Row]], None],
+    draw: Callable[[list[Row], Path], None],
+    peers: Callable[[bool], list[Row]] = lambda quick: [],
+) -> None:
+    """The main program of a benchmark.
+
+    `rows_of` makes the rows of one setting, in a process of its own, and `peers` those of
+    other programs, here; both are told whether a quick look is wanted. They are shown,
+    drawn, and saved under the name of the script.
+    """
+    chosen = _options(sys.modules["__main__"].__doc__ or "")
+    _pin()
+    if chosen.mode is not None:
+        if chosen.mode == "fast":
+            ej.enable_fast_loops()
+        jax.config.update("jax_enable_x64", True)
+        print(json.dumps(rows_of(chosen.quick)))
+        return
+    jax.config.update("jax_enable_x64", True)
+    rows = peers(chosen.quick) + _children(script, chosen.quick)
+    show(rows)
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    name = Path(script).stem
+    (chosen.out / f"{name}.json").write_text(json.dumps(rows, indent=1))
+    draw(rows, chosen.out / f"{name}.png")
+
+
+def _options(doc: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=doc.partition("\n")[0])
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     parser.add_argument("--quick", action="store_true", help="less work, rougher times")
     parser.add_argument("--mode", choices=["default", "fast"], help=argparse.SUPPRESS)
     return parser.parse_args()
 
 
-def pin() -> None:
+def _pin() -> None:
     """Keep to one core: times of two are not comparable."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
 
-def enter(mode: str) -> None:
-    """Set up a child: before the first array is made."""
-    if mode == "fast":
-        ej.enable_fast_loops()
-    jax.config.update("jax_enable_x64", True)
-
-
-def hand_over(rows: list[Row]) -> None:
-    print(json.dumps(rows))
-
-
-def children(script: str, quick: bool) -> list[Row]:
+def _children(script: str, quick: bool) -> list[Row]:
     """The rows of a child for each setting; a GPU knows only one."""
     rows: list[Row] = []
     for mode in ("default", "fast"):
@@ -67,11 +86,18 @@ def device() -> Row:
     return dict(platform=first.platform, device=first.device_kind)
 
 
+def clock() -> float:
+    """Seconds: of the processor, so that other processes do not count; of the wall where
+    the work is done elsewhere."""
+    on_cpu = jax.default_backend() == "cpu"
+    return time.process_time() if on_cpu else time.perf_counter()
+
+
 def compiled(fn: Callable, *args: Any) -> tuple[Any, float]:
     """The program of `fn`, and the seconds that it took to compile."""
-    begin = time.perf_counter()
+    begin = clock()
     program = jax.jit(fn).lower(*args).compile()
-    return program, time.perf_counter() - begin
+    return program, clock() - begin
 
 
 def medians(programs: Sequence[Callable[[], Any]], repeats: int) -> list[float]:
@@ -79,14 +105,7 @@ def medians(programs: Sequence[Callable[[], Any]], repeats: int) -> list[float]:
     times: list[list[float]] = [[] for _ in programs]
     for _ in range(repeats):
         for program, record in zip(programs, times, strict=True):
-            begin = time.perf_counter()
+            begin = clock()
             jax.block_until_ready(program())
-            record.append(time.perf_counter() - begin)
+            record.append(clock() - begin)
     return [statistics.median(record) for record in times]
-
-
-def write(rows: list[Row], out: Path, name: str) -> Path:
-    """Saves the rows; where the picture belongs."""
-    out.mkdir(parents=True, exist_ok=True)
-    (out / f"{name}.json").write_text(json.dumps(rows, indent=1))
-    return out / f"{name}.png"

@@ -1,34 +1,26 @@
 """What a step costs: our schemes beside EXUDYN, on the double pendulum and the heavy top.
 
-    python benchmarks/step_cost.py [--out FOLDER]
+    python benchmarks/step_cost.py [--out FOLDER] [--quick]
 
 Each row is a run, whose error is measured first; a wrong answer is reported and not timed.
-Times are medians over interleaved repeats, of the processor (so that other processes do
-not count) on one core (the process pins itself), with XLA's default settings and with
-`enable_fast_loops()` (two processes). The pendulum is released from the horizontal, two
-unit rods and masses; the top is `problems.heavy_top`.
-EXUDYN (the extra `peers`) runs the generalized-alpha method, rho 0.9, in the same Cartesian
+Times are medians over interleaved repeats, of the processor, on one core, with XLA's
+default settings and with `enable_fast_loops()` (two processes). The pendulum is released
+from the horizontal, two unit rods and masses; the top is `problems.heavy_top`. EXUDYN (the
+extra `peers`) runs the generalized-alpha method, rho 0.9, in the same Cartesian
 coordinates. Writes step_cost.json and step_cost.png.
 """
 
-import argparse
 import dataclasses
-import json
-import os
-import statistics
-import subprocess
-import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
-import jax
+import harness
 import numpy as np
 
 import enerjax as ej
 
 
-REPEATS = 7
+REPEATS, QUICK_REPEATS = 7, 2
 # When the errors are taken.
 PENDULUM_END, TOP_END = 10.0, 1.0
 # Schemes, steps, and the largest error that is still a right answer.
@@ -73,9 +65,9 @@ def problem_of(work: str) -> ej.problems.Problem:
     return ej.problems.heavy_top()
 
 
-def our_runs(exact: dict[str, list[float]]) -> list[dict]:
-    """Rows of this process, timed in turn."""
-    rows: list[dict] = []
+def our_rows(quick: bool) -> list[harness.Row]:
+    exact = reference()
+    rows: list[harness.Row] = []
     programs: list[Callable] = []
     for work, table, end in (("pendulum", PENDULUM, PENDULUM_END), ("top", TOP, TOP_END)):
         system, start, args = problem_of(work)
@@ -90,9 +82,7 @@ def our_runs(exact: dict[str, list[float]]) -> list[dict]:
                     system, scheme, start, args, h=h, num_steps=steps, save_every=steps
                 )
 
-            begin = time.process_time()
-            program = jax.jit(run).lower(start, args, h).compile()
-            seconds = time.process_time() - begin
+            program, seconds = harness.compiled(run, start, args, h)
             solution = program(start, args, h)
             position = np.asarray(solution.ys.q[-1])[: len(exact[work])]
             error = float(np.max(np.abs(position - exact[work])))
@@ -108,39 +98,25 @@ def our_runs(exact: dict[str, list[float]]) -> list[dict]:
                 print(f"{name} on the {work} is off by {error:.1e}: not timed")
             rows.append(row)
     timed = [row for row in rows if "steps" in row]
-    times: list[list[float]] = [[] for _ in timed]
-    for _ in range(REPEATS):
-        for program, record in zip(programs, times, strict=True):
-            begin = time.process_time()
-            jax.block_until_ready(program())
-            record.append(time.process_time() - begin)
-    for row, record in zip(timed, times, strict=True):
-        row["us_per_step"] = 1e6 * statistics.median(record) / row["steps"]
-    return rows
+    times = harness.medians(programs, QUICK_REPEATS if quick else REPEATS)
+    for row, seconds in zip(timed, times, strict=True):
+        row["us_per_step"] = 1e6 * seconds / row["steps"]
+    return [row | harness.device() for row in rows]
 
 
-def exudyn_runs(exact: dict[str, list[float]]) -> list[dict]:
+def exudyn_rows(quick: bool) -> list[harness.Row]:
     """The same work by EXUDYN, or no rows where it is not installed."""
     try:
         import step_cost_exudyn
     except ImportError:
         print("EXUDYN is not installed (extra `peers`): no rows to compare with")
         return []
-    return step_cost_exudyn.rows(exact, PENDULUM_END, TOP_END, REPEATS)
+    repeats = QUICK_REPEATS if quick else REPEATS
+    rows = step_cost_exudyn.rows(reference(), PENDULUM_END, TOP_END, repeats)
+    return [row | dict(mode="exudyn") for row in rows]
 
 
-def child(mode: str, exact: dict) -> list[dict]:
-    """Rows of a process of its own."""
-    command = [sys.executable, __file__, "--mode", mode]
-    out = subprocess.run(
-        command, input=json.dumps(exact), capture_output=True, text=True, check=True
-    )
-    *messages, data = out.stdout.splitlines()
-    print("\n".join(messages)) if messages else None
-    return [row | dict(mode=mode) for row in json.loads(data)]
-
-
-def show(rows: list[dict]) -> None:
+def show(rows: list[harness.Row]) -> None:
     anchors = {r["work"]: r["us_per_step"] for r in rows if r["mode"] == "exudyn"}
     for row in rows:
         anchor = anchors.get(row["work"])
@@ -154,7 +130,7 @@ def show(rows: list[dict]) -> None:
         )
 
 
-def draw(rows: list[dict], path: Path) -> None:
+def draw(rows: list[harness.Row], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
@@ -170,30 +146,5 @@ def draw(rows: list[dict], path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="What a step costs.")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
-    parser.add_argument("--mode", help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    if options.mode == "exudyn":
-        print(json.dumps(exudyn_runs(json.load(sys.stdin))))
-        return
-    if options.mode is not None:
-        if options.mode == "fast":
-            ej.enable_fast_loops()
-        jax.config.update("jax_enable_x64", True)
-        print(json.dumps(our_runs(json.load(sys.stdin))))
-        return
-    jax.config.update("jax_enable_x64", True)
-    exact = {work: x.tolist() for work, x in reference().items()}
-    rows = [row for mode in ("exudyn", "default", "fast") for row in child(mode, exact)]
-    show(rows)
-    options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "step_cost.json").write_text(json.dumps(rows, indent=1))
-    draw(rows, options.out / "step_cost.png")
-
-
 if __name__ == "__main__":
-    main()
+    harness.run(__file__, our_rows, show, draw, exudyn_rows)

@@ -62,7 +62,7 @@ def _top():
 
 
 def _row(
-    work: str, build: Callable, h: float, end: float, exact: list[float], repeats: int
+    work: str, build: Callable, h: float, end: float, exact: np.ndarray, repeats: int
 ) -> dict:
     steps = round(end / h)
     settings = exu.SimulationSettings()
@@ -79,7 +79,7 @@ def _row(
         begin = time.process_time()
         system.SolveDynamic(settings, solverType=exu.DynamicSolverType.GeneralizedAlpha)
         times.append(time.process_time() - begin)
-        error = float(np.max(np.abs(position() - np.asarray(exact))))
+        error = float(np.max(np.abs(position() - exact)))
         del container
     return dict(
         work=work,
@@ -93,7 +93,7 @@ def _row(
 
 
 def rows(
-    exact: dict[str, list[float]], pendulum_end: float, top_end: float, repeats: int
+    exact: dict[str, np.ndarray], pendulum_end: float, top_end: float, repeats: int
 ) -> list[dict]:
     return [
         _row("pendulum", _pendulum, 1e-3, pendulum_end, exact["pendulum"], repeats),
