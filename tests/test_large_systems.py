@@ -5,14 +5,16 @@ import functools
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 import optimistix as optx
 import pytest
 from scipy.sparse import csr_array
 
 import enerjax as ej
-from enerjax._linear.banded import Band, BandFactors
+from enerjax._linear.banded import Band
 from enerjax._linear.blocks import BlockDiagonal, hessian, inverse_of
+from enerjax._linear.jacobian import jacobian_rows
 from enerjax._linear.pattern import jacobian_pattern
 
 from .helpers import EPS, SCHEMES
@@ -61,11 +63,33 @@ FUNCTIONS = {
 def test_the_pattern_covers_the_jacobian(name):
     fn, is_exact = FUNCTIONS[name]
     x = jnp.asarray(np.random.default_rng(1).normal(size=12))
-    pattern = jacobian_pattern(fn, x).toarray()
+    found = jacobian_pattern(fn, x)
+    assert found is not None
+    pattern = found.toarray()
     jacobian = np.asarray(jax.jacfwd(fn)(x) != 0).reshape(pattern.shape)
     assert not np.any(jacobian & ~pattern)
     if is_exact:
         np.testing.assert_array_equal(jacobian, pattern)
+
+
+def test_a_pattern_that_is_too_full_is_none(monkeypatch):
+    """A system of such functions runs all the same, densely."""
+    monkeypatch.setattr("enerjax._linear.dependence._TOO_MANY", 1000)
+    size = 40
+    mixed = lambda x: jnp.sin(jnp.cumsum(x))
+    assert jacobian_pattern(mixed, jnp.ones(size)) is None
+    rows, columns = jacobian_rows(mixed, jnp.ones(size + 40))
+    np.testing.assert_allclose(rows, jax.jacfwd(mixed)(jnp.ones(size + 40)))
+    assert columns.shape == rows.shape
+    system = ej.System(
+        lambda v, args: 0.5 * jnp.sum(v**2) + 0.1 * jnp.sum(v) ** 2,
+        lambda q, args: jnp.sum(jnp.cumsum(q) ** 4),
+        lambda q, args: jnp.sum(q[:2] ** 2)[None] - 1,
+    )
+    q = jnp.concatenate([jnp.array([1.0]), jnp.zeros(2 * size)])
+    start = ej.initial_state(system, q, jnp.zeros_like(q))
+    run = ej.simulate(system, ej.EnergyPreserving(), start, h=1e-3, num_steps=3)
+    assert np.ptp(run.audit.energy) <= 100 * EPS * run.audit.energy[0]  # round-off
 
 
 def _banded(size, rng):
@@ -87,7 +111,7 @@ def test_a_shuffled_band_is_found_and_solved(size):
     band = Band(csr_array(matrix != 0))
     assert band.width <= 12
     entries = band.evaluate(lambda x: jnp.asarray(matrix) @ x, jnp.zeros(size))
-    factors = BandFactors.empty(band, float).renewed(entries)
+    factors = band.empty(size, float).renewed(entries)
     x = factors.solve(jnp.asarray(right))
     bound = 1e3 * size * EPS * np.abs(matrix).max()  # round-off
     size_of = np.abs(np.linalg.solve(matrix, right)).max()
@@ -138,6 +162,37 @@ def test_a_chain_moves_as_with_a_dense_solver(scheme):
     leak = jnp.diff(run.audit.energy) + run.audit.dissipated[1:]
     assert jnp.max(jnp.abs(leak)) <= 50 * EPS
     assert jnp.max(jnp.abs(run.audit.constraint)) <= 50 * EPS
+
+
+@pytest.mark.parametrize("solver", ["LU", "QR", "KLU"])
+def test_a_given_linear_solver_is_used(solver):
+    """The same motion and derivatives, whoever solves the linear systems."""
+    if solver == "KLU":
+        pytest.importorskip("klujax")
+    given = ej.KLU() if solver == "KLU" else getattr(lx, solver)()
+    num_links = NUM_LINKS if solver == "KLU" else 3
+    system, start, args = ej.problems.chain(num_links)
+
+    def end(g, root_finder):
+        run = ej.simulate(
+            system,
+            ej.EnergyPreserving(),
+            start,
+            args | {"g": g},
+            h=2e-3,
+            num_steps=10,
+            root_finder=root_finder,
+        )
+        return run.ys.q[-1]
+
+    q, derivative = jax.jvp(
+        lambda g: end(g, ej.Newton(linear_solver=given)), (9.81,), (1.0,)
+    )
+    expected, rate = jax.jvp(lambda g: end(g, ej.Newton()), (9.81,), (1.0,))
+    np.testing.assert_allclose(q, expected, atol=1e-11)  # solver
+    np.testing.assert_allclose(derivative, rate, atol=1e-10)  # solver
+    pulled = jax.grad(lambda g: end(g, ej.Newton(linear_solver=given))[-1])(9.81)
+    assert pulled == pytest.approx(float(rate[-1]), rel=1e-9)  # solver
 
 
 def test_derivatives_of_a_chain():

@@ -18,6 +18,7 @@ from ._initial import (
     ConsistentStart as ConsistentStart,
     initial_state as initial_state,
 )
+from ._linear import KLU as KLU
 from ._newton import Newton as Newton
 from ._results import RESULTS as RESULTS
 from ._schemes import (

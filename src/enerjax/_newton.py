@@ -3,10 +3,11 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from ._linear import AbstractFactors, Linearisable
+from ._linear import AbstractFactors, KLU, Linearisable
 from ._types import Count, Flag, Scalar
 
 
@@ -30,10 +31,24 @@ class Newton(eqx.Module):
 
     - `rtol`: bound on the predicted error, in units of round-off of the dtype.
     - `atol`: bound on the residual, in the same units.
+    - `linear_solver`: for its corrections and for derivatives of the root; one of lineax,
+      given the dense Jacobian, or `KLU()` where it is large and sparse. Without it size
+      and structure decide: plain operations up to 32 unknowns, LAPACK, and above 64 the
+      narrow band that the pattern of the equations can be numbered into, if there is one.
+
+    A `linear_solver` of another type raises a `TypeError`.
     """
 
     rtol: float = 1.0
     atol: float = 8.0
+    linear_solver: lx.AbstractLinearSolver | KLU | None = None
+
+    def __check_init__(self):
+        if not isinstance(self.linear_solver, lx.AbstractLinearSolver | KLU | None):
+            raise TypeError(
+                "`Newton(linear_solver=...)` must be a solver of lineax, such as "
+                f"`lineax.LU()`, or `enerjax.KLU()`; got {self.linear_solver!r}."
+            )
 
 
 class Start(eqx.Module):

@@ -68,9 +68,10 @@ def _search(
         steps = solution.stats["num_steps"]
         return Root(solution.value, start.factors, steps, found, singular | nonfinite)
     flat, unravel, flat_fn = _flattened(fn, start.guess)
-    residual = linearisable(flat_fn, flat, args)
+    residual = linearisable(flat_fn, flat, args, root_finder.linear_solver)
     last = newton_iterations(residual, root_finder, start, max_iterations)
-    factors = None if start.factors is None else last.factors
+    keeps = residual.is_dense and start.factors is not None
+    factors = last.factors if keeps else start.factors
     return Root(unravel(last.x), factors, last.corrections, last.done, last.broken)
 
 
@@ -96,7 +97,8 @@ def _root_jvp(primals, tangents):
     flat, unravel, flat_fn = _flattened(fn, root.value)
     by_args = lambda moved: flat_fn(flat, eqx.combine(moved, fixed))
     _, rate = jax.jvp(by_args, (moved,), (t_args,))
-    change = linearisable(flat_fn, flat, args).solve(flat, -rate)
+    given = root_finder.linear_solver if isinstance(root_finder, Newton) else None
+    change = linearisable(flat_fn, flat, args, given).solve(flat, -rate)
     # Nothing but the root itself depends on the arguments: not how it was found.
     still = jax.tree.map(jnp.zeros_like, eqx.filter(root, eqx.is_inexact_array))
     return root, eqx.tree_at(lambda root: root.value, still, unravel(change))

@@ -12,6 +12,7 @@ from .dense import (
     inverse as inverse,
     solve as solve,
 )
+from .given import KLU as KLU
 from .jacobian import (
     affine_root as affine_root,
     jacobian_rows as jacobian_rows,

@@ -30,6 +30,7 @@ class Band:
       the coloured products; beyond the last of them where they are zero.
     - `order`: the numbers of the unknowns along the band, filled up with the size.
     - `back`: where each unknown stands along the band.
+    - `filling`: the ones on the diagonal of rows that only fill up the last block.
     """
 
     def __init__(self, pattern: csr_array):
@@ -51,10 +52,20 @@ class Band:
         nowhere = self.num_colours * size
         self.places = np.full((blocks, width, 3 * width), nowhere)
         self.places[block, row, column] = self.colours[columns] * size + rows
+        self.filling = np.zeros(self.places.shape)
+        short = np.arange(blocks * width - size)
+        self.filling[-1, width - 1 - short, 2 * width - 1 - short] = 1
 
     def worth_it(self) -> bool:
         """Whether its elimination is less work than that of the dense matrix."""
         return 40 * self.num_blocks * self.width**3 < self.size**3
+
+    def empty(self, size: int, dtype: Any) -> "BandFactors":
+        """Factors of no matrix yet."""
+        del size
+        blocks, width = self.num_blocks, self.width
+        turns = jnp.zeros((blocks, 2 * width, 2 * width), dtype)
+        return BandFactors(self, turns, jnp.zeros((blocks, width, 2 * width), dtype))
 
     def evaluate(
         self, fn: Callable[[Array], Array], x: Float[Array, " n"]
@@ -62,13 +73,7 @@ class Band:
         """The band of the Jacobian of `fn` at `x`."""
         products = coloured_products(fn, x, self.colours)
         entries = jnp.append(products.ravel(), 0)
-        band = entries[self.places]
-        # Rows that only fill up the last block.
-        full = np.zeros(self.places.shape)
-        for k in range(self.size, self.num_blocks * self.width):
-            block, row = divmod(k, self.width)
-            full[block, row, self.width + row] = 1
-        return band + jnp.asarray(full, x.dtype)
+        return entries[self.places] + jnp.asarray(self.filling, x.dtype)
 
 
 def coloured_products(
@@ -107,12 +112,6 @@ class BandFactors(AbstractFactors):
     band: Band = eqx.field(static=True)
     turns: Float[Array, "blocks two_widths two_widths"]
     upper: Float[Array, "blocks width two_widths"]
-
-    @classmethod
-    def empty(cls, band: Band, dtype: Any) -> "BandFactors":
-        blocks, width = band.num_blocks, band.width
-        turns = jnp.zeros((blocks, 2 * width, 2 * width), dtype)
-        return cls(band, turns, jnp.zeros((blocks, width, 2 * width), dtype))
 
     def renewed(self, matrix: Float[Array, "blocks width three_widths"]) -> "BandFactors":
         width = self.band.width

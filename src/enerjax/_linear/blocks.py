@@ -12,16 +12,18 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from .._tracing import is_known
-from .dependence import Dense
-from .pattern import jacobian_pattern
+from .pattern import jacobian_pattern, LARGE
 
 
-# Rows from which structure is looked for, and of the largest block that counts as small.
-_LARGE, _BLOCK = 64, 16
+# Rows of the largest block that counts as small.
+_BLOCK = 16
 
 
 class Places:
-    """Which rows belong together; the same for a matrix and its inverse."""
+    """Which rows belong together; the same for a matrix and its inverse.
+
+    `filling` are the ones on the diagonal where a block is smaller than the largest.
+    """
 
     def __init__(self, labels: np.ndarray):
         self._key = labels.tobytes()
@@ -31,6 +33,7 @@ class Places:
         within = np.arange(size) - starts[labels[order]]
         self.rows = np.full((sizes.size, sizes.max()), size)
         self.rows[labels[order], within] = order
+        self.filling = (self.rows == size)[:, :, None] * np.eye(sizes.max())
         self.back = np.zeros(size, int)
         self.back[order] = labels[order] * sizes.max() + within
         self.within = np.zeros(size, int)
@@ -107,12 +110,8 @@ def blocks_of(matrix: Symmetric) -> Float[Array, "blocks size size"]:
 def hessian(fn: Callable[[Array], Array], at: Float[Array, " n"]) -> Symmetric:
     """The Hessian of a scalar function; of blocks where it is large and falls apart."""
     gradient = jax.grad(fn)
-    if at.size <= _LARGE:
-        return jax.jacfwd(gradient)(at)
-    try:
-        places = _places(jacobian_pattern(gradient, at))
-    except Dense:
-        places = None
+    pattern = jacobian_pattern(gradient, at) if at.size > LARGE else None
+    places = None if pattern is None else _places(pattern)
     if places is None:
         return jax.jacfwd(gradient)(at)
     # One product for each column of the blocks, for all blocks at once.
@@ -120,21 +119,20 @@ def hessian(fn: Callable[[Array], Array], at: Float[Array, " n"]) -> Symmetric:
     seeds = jnp.asarray(np.arange(size)[:, None] == places.within, at.dtype)
     push = lambda seed: jax.jvp(gradient, (at,), (seed,))[1]
     columns = jnp.pad(jax.vmap(push)(seeds), ((0, 0), (0, 1)))[:, places.rows]
-    filled = jnp.asarray((places.rows == at.size)[:, :, None] * np.eye(size), at.dtype)
-    return BlockDiagonal(places, jnp.transpose(columns, (1, 2, 0)) + filled)
+    filling = jnp.asarray(places.filling, at.dtype)
+    return BlockDiagonal(places, jnp.transpose(columns, (1, 2, 0)) + filling)
 
 
 def in_blocks(matrix: Float[Array, "n n"]) -> Symmetric:
     """A given matrix; of blocks where it is large, known and falls apart."""
-    if matrix.shape[0] <= _LARGE or not is_known(matrix):
+    if matrix.shape[0] <= LARGE or not is_known(matrix):
         return matrix
     places = _places(csr_array(np.asarray(matrix) != 0))
     if places is None:
         return matrix
     padded = jnp.pad(matrix, ((0, 1), (0, 1))).at[-1, -1].set(0)
     blocks = padded[places.rows[:, :, None], places.rows[:, None, :]]
-    filled = (places.rows == matrix.shape[0])[:, :, None] * np.eye(places.rows.shape[1])
-    return BlockDiagonal(places, blocks + jnp.asarray(filled, matrix.dtype))
+    return BlockDiagonal(places, blocks + jnp.asarray(places.filling, matrix.dtype))
 
 
 def _places(pattern: csr_array) -> Places | None:

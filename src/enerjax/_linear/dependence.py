@@ -192,7 +192,7 @@ _first = lambda values: [0]
 _all = lambda values: range(len(values))
 # The operands whose entries move; the others are indices.
 _MOVED: dict[str, Callable] = {
-    "reshape": _first, "transpose": _first, "squeeze": _first, "expand_dims": _first,
+    "reshape": _first, "transpose": _first, "squeeze": _first,
     "broadcast_in_dim": _first, "slice": _first, "rev": _first, "gather": _first,
     "dynamic_slice": _first, "copy": _first, "concatenate": _all, "pad": _all,
     "stack": _all, "unstack": _first,
@@ -203,7 +203,7 @@ _ELEMENTWISE = (
     "add sub mul div rem neg sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh "
     "atanh exp exp2 expm1 log log1p sqrt rsqrt cbrt pow integer_pow square abs max min "
     "clamp select_n logistic erf erfc erf_inv lgamma digamma add_any nextafter "
-    "convert_element_type reduce_precision copy_p real imag"
+    "convert_element_type reduce_precision real imag"
 )
 RULES: dict[str, Callable] = {
     **{name: _elementwise for name in _ELEMENTWISE.split()},

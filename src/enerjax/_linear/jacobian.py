@@ -6,18 +6,30 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from .banded import Band, BandFactors, coloured_products, column_colours
+from .banded import Band, coloured_products, column_colours
 from .dense import AbstractFactors, Inverse, LU, SMALL, solve
-from .dependence import Dense
 from .dots import plain_products
-from .pattern import jacobian_pattern
+from .given import KLU, LineaxFactors, Scattered
+from .pattern import jacobian_pattern, LARGE
 
 
-# Unknowns from which structure is looked for.
-_LARGE = 64
+class Full:
+    """A matrix that is stored as one array."""
+
+    def __init__(self, solver: lx.AbstractLinearSolver | None):
+        self.solver = solver
+
+    def evaluate(self, fn: Callable[[Array], Array], x: Float[Array, " n"]) -> Array:
+        return jax.jacfwd(fn)(x)
+
+    def empty(self, size: int, dtype: Any) -> AbstractFactors:
+        if self.solver is None:
+            return LU.empty(size, dtype)
+        return LineaxFactors(self.solver, jnp.zeros((size, size), dtype))
 
 
 class Linearisable(eqx.Module):
@@ -28,56 +40,63 @@ class Linearisable(eqx.Module):
     """
 
     value: Callable[[Float[Array, " n"]], Float[Array, " n"]]
-    band: Band | None
+    form: Full | Band | Scattered
+
+    @property
+    def is_dense(self) -> bool:
+        """Whether its Jacobian is dense, and solved with as this package sees fit."""
+        return isinstance(self.form, Full) and self.form.solver is None
 
     def jacobian(self, x: Float[Array, " n"]) -> Array:
         """The Jacobian, in the form that `first_factors` are renewed with."""
-        if self.band is not None:
-            return self.band.evaluate(self.value, x)
-        return jax.jacfwd(self.value)(x)
+        return self.form.evaluate(self.value, x)
 
     def first_factors(
         self, kept: AbstractFactors | None, x: Float[Array, " n"]
     ) -> AbstractFactors:
         """What the first Jacobian of an iteration renews."""
-        if kept is not None:
+        if kept is not None and self.is_dense:
             return kept
-        if self.band is not None:
-            return BandFactors.empty(self.band, x.dtype)
-        return LU.empty(x.size, x.dtype)
+        return self.form.empty(x.size, x.dtype)
 
     def solve(self, x: Float[Array, " n"], right: Float[Array, " n"]) -> Array:
         """`J(x)^-1 right`, differentiable in all there is, and transposable in `right`."""
         matrix = self.jacobian(x)
-        if self.band is None:
+        if self.is_dense:
             return solve(matrix, right)
-        factors = BandFactors.empty(self.band, x.dtype).renewed(matrix)
+        factors = self.form.empty(x.size, x.dtype).renewed(matrix)
         factors = jax.lax.stop_gradient(factors)
-
-        def transposed(multiply, right):
-            del multiply
-            return jax.linear_transpose(factors.solve, right)(right)[0]
-
         return jax.lax.custom_linear_solve(
             lambda t: jax.jvp(self.value, (x,), (t,))[1],
             right,
             lambda _, right: factors.solve(right),
-            transposed,
+            lambda _, right: factors.solve_transposed(right),
         )
 
 
 def linearisable(
-    fn: Callable[[Array, PyTree], Array], like: Float[Array, " n"], args: Any
+    fn: Callable[[Array, PyTree], Array],
+    like: Float[Array, " n"],
+    args: Any,
+    linear_solver: lx.AbstractLinearSolver | KLU | None = None,
 ) -> Linearisable:
-    """`fn(x, args)` as a function of `x`; what it depends on must be in `args`."""
+    """`fn(x, args)` as a function of `x`; what it depends on must be in `args`.
+
+    Without a `linear_solver` the size and the structure of the Jacobian decide.
+    """
     value = plain_products(fn, like, args)
-    if like.size <= _LARGE:
-        return Linearisable(value, None)
-    try:
-        band = Band(jacobian_pattern(value, like))
-    except Dense:
-        return Linearisable(value, None)
-    return Linearisable(value, band if band.worth_it() else None)
+    if isinstance(linear_solver, lx.AbstractLinearSolver):
+        return Linearisable(value, Full(linear_solver))
+    full = Linearisable(value, Full(None))
+    if like.size <= LARGE:
+        return full
+    pattern = jacobian_pattern(value, like)
+    if pattern is None:
+        return full
+    if isinstance(linear_solver, KLU):
+        return Linearisable(value, Scattered(pattern))
+    band = Band(pattern)
+    return Linearisable(value, band) if band.worth_it() else full
 
 
 def affine_root(
@@ -86,7 +105,7 @@ def affine_root(
     """Where an affine function vanishes; differentiable in what it closes over."""
     at = jnp.zeros_like(like)
     linear = linearisable(lambda x, _: fn(x), at, None)
-    if linear.band is None:
+    if linear.is_dense:
         return -jnp.linalg.solve(linear.jacobian(at), linear.value(at))
     return -linear.solve(at, linear.value(at))
 
@@ -96,10 +115,10 @@ def jacobian_rows(
 ) -> tuple[Float[Array, "m width"], Int[np.ndarray, "m width"]]:
     """The entries of the rows of a Jacobian, and their columns; zeros fill short rows."""
     num_rows = jax.eval_shape(lambda x: fn(x), x).shape[0]
-    if x.size <= _LARGE:
+    pattern = jacobian_pattern(lambda x: fn(x), x) if x.size > LARGE else None
+    if pattern is None:
         columns = np.broadcast_to(np.arange(x.size), (num_rows, x.size))
         return jax.jacfwd(fn)(x), columns
-    pattern = jacobian_pattern(lambda x: fn(x), x)
     colours = column_colours(pattern, np.arange(x.size))
     products = coloured_products(fn, x, colours)
     counts = np.diff(pattern.indptr)

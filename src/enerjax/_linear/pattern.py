@@ -17,21 +17,28 @@ from jaxtyping import Array
 from scipy.sparse import csr_array
 
 from .._tracing import evaluate, interpret, is_known
-from .dependence import Constant, Depends, everything, RULES, Value
+from .dependence import Constant, Dense, Depends, everything, RULES, Value
 
 
-def jacobian_pattern(fn: Callable[[Array], Array], like: Array) -> csr_array:
+# Unknowns from which structure is looked for.
+LARGE = 64
+
+
+def jacobian_pattern(fn: Callable[[Array], Array], like: Array) -> csr_array | None:
     """The entries of `d fn / dx` that can differ from zero; rows are those of `fn`.
 
-    Shape `(fn(like).size, like.size)`. Of a traced program: nothing is evaluated but
-    indices.
+    Shape `(fn(like).size, like.size)`; `None` where so many can that the pattern is of no
+    use. Of a traced program: nothing is evaluated but indices.
     """
     program = jax.make_jaxpr(fn)(like)
     size = like.size
     unknowns = Depends(_identity(size), like)
     consts = [c if is_known(c) else Constant(jnp.asarray(c)) for c in program.consts]
-    with jax.ensure_compile_time_eval():
-        (out,) = interpret(program.jaxpr, consts, [unknowns], _equation)
+    try:
+        with jax.ensure_compile_time_eval():
+            (out,) = interpret(program.jaxpr, consts, [unknowns], _equation)
+    except Dense:
+        return None
     if isinstance(out, Depends):
         return out.rows
     return csr_array((int(np.prod(jnp.shape(out))), size), dtype=bool)
