@@ -34,6 +34,7 @@ from ._solution import Solution as Solution, Statistics as Statistics
 from ._step import step as step, StepOutput as StepOutput, Warm as Warm
 from ._system import (
     AbstractSystem as AbstractSystem,
+    Elements as Elements,
     State as State,
     System as System,
 )

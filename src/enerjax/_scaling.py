@@ -25,7 +25,8 @@ def scales_like(
         joint = scales.constraint[: x.velocity_impulse.size]
         rate = root / scales.coordinate
         momentum = (root * scales.coordinate)[: x.momentum.size]
-        return Increment(rate, momentum, root / scales.constraint, root / joint)
+        impulse = (root / scales.constraint)[: x.impulse.size]
+        return Increment(rate, momentum, impulse, root / joint)
 
     def row(x):
         if not is_increment(x):
@@ -36,6 +37,6 @@ def scales_like(
         position = root * scales.constraint + scales.constraint_size / jnp.abs(h)
         momentum = root * scales.coordinate
         rate = (root / scales.coordinate)[: x.momentum.size]
-        return Increment(momentum, rate, position, root * joint)
+        return Increment(momentum, rate, position[: x.impulse.size], root * joint)
 
     return tuple(jax.tree.map(f, z, is_leaf=is_increment) for f in (unknown, row))  # pyright: ignore

@@ -6,4 +6,8 @@ from .chain import (
     discrete_jacobian as discrete_jacobian,
     discrete_jvp as discrete_jvp,
 )
-from .corrected import Gonzalez as Gonzalez, MeanValue as MeanValue
+from .corrected import (
+    AbstractCorrected as AbstractCorrected,
+    Gonzalez as Gonzalez,
+    MeanValue as MeanValue,
+)

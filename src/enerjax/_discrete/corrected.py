@@ -17,19 +17,22 @@ and the value and all its derivatives stay finite down to `b = a`. For functions
 at most quadratic the bracket is nothing but round-off at any `d`.
 """
 
-from collections.abc import Callable
+import abc
+from collections.abc import Callable, Iterable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from .._types import Coordinates, Scalar
 from .base import AbstractDerivative, significant
 
 
-def _corrected(
-    fn: Callable[[Coordinates], Scalar],
+def _closed(
+    fn_a: Scalar,
+    fn_b: Scalar,
     a: Coordinates,
     b: Coordinates,
     mean: Coordinates,
@@ -37,7 +40,6 @@ def _corrected(
 ) -> Coordinates:
     d = b - a
     along = weights * d
-    fn_a, fn_b = fn(a), fn(b)
     defect = fn_b - fn_a - mean @ d
     size = abs(fn_a) + abs(fn_b) + abs(mean) @ (abs(a) + abs(b))
     defect = significant(defect, size)
@@ -47,15 +49,24 @@ def _corrected(
     return mean + defect / length2 * along
 
 
-class Gonzalez(AbstractDerivative):
-    """Gonzalez' midpoint discrete gradient: one gradient and two evaluations.
+class AbstractCorrected(AbstractDerivative):
+    """A mean gradient by quadrature, made exact along the increment."""
 
-    Second-order accurate; exact midpoint gradient for quadratic functions. Keeps no
-    symmetry of `fn`: momenta are conserved to second order only.
+    @abc.abstractmethod
+    def _quadrature(self) -> Iterable[tuple[float, float]]:
+        """Nodes in [-1, 1], and what they contribute, 1 in all."""
 
-    **Reference:** O. Gonzalez, Time integration and discrete Hamiltonian systems,
-    J. Nonlinear Sci. 6 (1996) 449-467.
-    """
+    def _mean(
+        self, fn: Callable[[Coordinates], Array], a: Coordinates, b: Coordinates
+    ) -> Array:
+        mid, half = 0.5 * (a + b), 0.5 * (b - a)
+        # Unrolled: a batched gradient hides the structure of `fn` from XLA.
+        return jnp.asarray(
+            sum(
+                jnp.asarray(share, a.dtype) * fn(mid + jnp.asarray(x, a.dtype) * half)
+                for x, share in self._quadrature()
+            )
+        )
 
     def gradient(
         self,
@@ -65,10 +76,41 @@ class Gonzalez(AbstractDerivative):
         *,
         weights: Coordinates | float = 1.0,
     ) -> Coordinates:
-        return _corrected(fn, a, b, jax.grad(fn)(0.5 * (a + b)), weights)
+        return _closed(fn(a), fn(b), a, b, self._mean(jax.grad(fn), a, b), weights)
+
+    def gradients_of_rows(
+        self,
+        fn: Callable[[Coordinates], Float[Array, " rows"]],
+        gradients: Callable[[Coordinates], Float[Array, "rows width"]],
+        own: Callable[[Coordinates], Float[Array, "rows width"]],
+        a: Coordinates,
+        b: Coordinates,
+    ) -> Float[Array, "rows width"]:
+        """The discrete gradient of each row of `fn`, in the coordinates that it depends on.
+
+        `own` picks these from all, and `gradients` are the derivatives with respect to
+        them. Corrections by rows couple no coordinates that the function does not.
+        """
+        mean = self._mean(gradients, a, b)
+        close = jax.vmap(lambda *ends: _closed(*ends, weights=1.0))
+        return close(fn(a), fn(b), own(a), own(b), mean)
 
 
-class MeanValue(AbstractDerivative):
+class Gonzalez(AbstractCorrected):
+    """Gonzalez' midpoint discrete gradient: one gradient and two evaluations.
+
+    Second-order accurate; exact midpoint gradient for quadratic functions. Keeps no
+    symmetry of `fn`: momenta are conserved to second order only.
+
+    **Reference:** O. Gonzalez, Time integration and discrete Hamiltonian systems,
+    J. Nonlinear Sci. 6 (1996) 449-467.
+    """
+
+    def _quadrature(self) -> Iterable[tuple[float, float]]:
+        return ((0.0, 1.0),)
+
+
+class MeanValue(AbstractCorrected):
     """The gradient averaged over the segment by Gauss quadrature, then corrected.
 
     With two or more points it approximates the mean-value (averaged vector field)
@@ -91,19 +133,6 @@ class MeanValue(AbstractDerivative):
         if self.points < 1:
             raise ValueError(f"`MeanValue(points={self.points})`: use 1 point or more.")
 
-    def gradient(
-        self,
-        fn: Callable[[Coordinates], Scalar],
-        a: Coordinates,
-        b: Coordinates,
-        *,
-        weights: Coordinates | float = 1.0,
-    ) -> Coordinates:
+    def _quadrature(self) -> Iterable[tuple[float, float]]:
         nodes, shares = np.polynomial.legendre.leggauss(self.points)
-        mid, half = 0.5 * (a + b), 0.5 * (b - a)
-        # Unrolled: a batched gradient hides the structure of `fn` from XLA.
-        mean = sum(
-            jnp.asarray(w / 2, a.dtype) * jax.grad(fn)(mid + jnp.asarray(x, a.dtype) * half)
-            for x, w in zip(nodes, shares, strict=True)
-        )
-        return _corrected(fn, a, b, jnp.asarray(mean), weights)
+        return zip(nodes.tolist(), (shares / 2).tolist(), strict=True)

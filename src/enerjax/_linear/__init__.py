@@ -1,3 +1,7 @@
+from .assembled import (
+    Assembled as Assembled,
+    row_hessians as row_hessians,
+)
 from .blocks import (
     as_dense as as_dense,
     BlockDiagonal as BlockDiagonal,
@@ -13,11 +17,13 @@ from .dense import (
     solve as solve,
 )
 from .given import KLU as KLU
+from .indices import Indices as Indices
 from .jacobian import (
     affine_root as affine_root,
-    jacobian_rows as jacobian_rows,
     kept_factors as kept_factors,
     Linearisable as Linearisable,
     linearisable as linearisable,
+    RowPattern as RowPattern,
 )
+from .pattern import jacobian_pattern as jacobian_pattern, LARGE as LARGE
 from .symmetric import cholesky as cholesky, eigh as eigh

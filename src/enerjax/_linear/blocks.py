@@ -12,6 +12,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from .._tracing import is_known
+from .indices import Indices
 from .pattern import jacobian_pattern, LARGE
 
 
@@ -19,14 +20,14 @@ from .pattern import jacobian_pattern, LARGE
 _BLOCK = 16
 
 
-class Places:
+class Places(Indices):
     """Which rows belong together; the same for a matrix and its inverse.
 
     `filling` are the ones on the diagonal where a block is smaller than the largest.
     """
 
     def __init__(self, labels: np.ndarray):
-        self._key = labels.tobytes()
+        super().__init__(labels)
         size, sizes = labels.size, np.bincount(labels)
         order = np.argsort(labels, kind="stable")
         starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
@@ -38,13 +39,6 @@ class Places:
         self.back[order] = labels[order] * sizes.max() + within
         self.within = np.zeros(size, int)
         self.within[order] = within
-
-    # Two systems that are made alike share their programs.
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Places) and self._key == other._key
-
-    def __hash__(self) -> int:
-        return hash(self._key)
 
 
 class BlockDiagonal(eqx.Module):

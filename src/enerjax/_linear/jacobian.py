@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from .banded import Band, coloured_products, column_colours
 from .dense import AbstractFactors, Inverse, LU, SMALL, solve
@@ -110,26 +110,44 @@ def affine_root(
     return -linear.solve(at, linear.value(at))
 
 
-def jacobian_rows(
-    fn: Callable[[Array], Array], x: Float[Array, " n"]
-) -> tuple[Float[Array, "m width"], Int[np.ndarray, "m width"]]:
-    """The entries of the rows of a Jacobian, and their columns; zeros fill short rows."""
-    num_rows = jax.eval_shape(lambda x: fn(x), x).shape[0]
-    pattern = jacobian_pattern(lambda x: fn(x), x) if x.size > LARGE else None
-    if pattern is None:
-        columns = np.broadcast_to(np.arange(x.size), (num_rows, x.size))
-        return jax.jacfwd(fn)(x), columns
-    colours = column_colours(pattern, np.arange(x.size))
-    products = coloured_products(fn, x, colours)
-    counts = np.diff(pattern.indptr)
-    rows = np.repeat(np.arange(num_rows), counts)
-    within = np.arange(rows.size) - np.repeat(pattern.indptr[:-1], counts)
-    columns = np.zeros((num_rows, max(counts.max(initial=0), 1)), int)
-    columns[rows, within] = pattern.indices
-    filled = np.zeros(columns.shape)
-    filled[rows, within] = 1
-    entries = products[colours[columns], np.arange(num_rows)[:, None]]
-    return entries * jnp.asarray(filled, x.dtype), columns
+class RowPattern:
+    """Which unknowns each row of a function depends on. Made while a program is traced.
+
+    `columns`: their numbers, shape `(m, width)`; zeros fill short rows.
+    """
+
+    def __init__(self, fn: Callable[[Array], Array], like: Float[Array, " n"]):
+        size = like.size
+        num_rows = jax.eval_shape(lambda x: fn(x), like).shape[0]
+        pattern = jacobian_pattern(lambda x: fn(x), like) if size > LARGE else None
+        if pattern is None:
+            self.columns = np.broadcast_to(np.arange(size), (num_rows, size))
+            self._colours = np.arange(size)
+            self._filled = np.ones((num_rows, size))
+            return
+        self._colours = column_colours(pattern, np.arange(size))
+        counts = np.diff(pattern.indptr)
+        rows = np.repeat(np.arange(num_rows), counts)
+        within = np.arange(rows.size) - np.repeat(pattern.indptr[:-1], counts)
+        self.columns = np.zeros((num_rows, max(counts.max(initial=0), 1)), int)
+        self.columns[rows, within] = pattern.indices
+        self._filled = np.zeros(self.columns.shape)
+        self._filled[rows, within] = 1
+
+    def own(self, x: Float[Array, " n"]) -> Float[Array, "m width"]:
+        """The unknowns of each row; zeros fill short rows."""
+        return x[self.columns] * jnp.asarray(self._filled, x.dtype)
+
+    def derivative(
+        self, fn: Callable[[Array], Array], x: Float[Array, " n"]
+    ) -> Float[Array, "m ... width"]:
+        """Of a function with such rows, `(m, ...)`; zeros where the rows are short."""
+        products = coloured_products(fn, x, self._colours)
+        numbers = np.arange(self.columns.shape[0])
+        entries = products[self._colours[self.columns], numbers[:, None]]
+        entries = jnp.moveaxis(entries, 1, -1)
+        shape = (numbers.size, *[1] * (entries.ndim - 2), -1)
+        return entries * jnp.asarray(self._filled, x.dtype).reshape(shape)
 
 
 def kept_factors(size: int, dtype: Any) -> AbstractFactors | None:

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._discrete import AbstractDerivative
-from .._linear import jacobian_rows, Symmetric
+from .._linear import Assembled, RowPattern, Symmetric
 from .._system import AbstractSystem, State
 from .._types import (
     Args,
@@ -151,8 +151,11 @@ class AbstractModel(eqx.Module):
     @abc.abstractmethod
     def stiffness(
         self, state: State, multipliers: Multipliers
-    ) -> tuple[Float[Array, "nq nq"], Float[Array, "nq nq"]]:
-        """`Hess_q (H + lambda . Phi)` and the inertia, where `L = I`."""
+    ) -> tuple[Float[Array, "nq nq"] | Assembled, Symmetric]:
+        """`Hess_q (H + lambda . Phi)` and the inertia, where `L = I`.
+
+        Of many elements the first is assembled and the second in blocks, where it can be.
+        """
 
     @abc.abstractmethod
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
@@ -190,7 +193,8 @@ class AbstractModel(eqx.Module):
         """The scales at `q`. They steer Newton's tests and never enter a solution."""
         q = state.q
         coordinate = jnp.sqrt(self.metric(state).diagonal())
-        entries, columns = jacobian_rows(self.constraint, q)
+        pattern = RowPattern(self.constraint, q)
+        entries, columns = pattern.derivative(self.constraint, q), pattern.columns
         constraint = jnp.sqrt(jnp.sum((entries / coordinate[columns]) ** 2, axis=1))
         # A gradient that vanishes makes the step equations singular, which is reported
         # as such; it must not turn the scaling into a division by zero.

@@ -10,13 +10,22 @@ which leaves `S_mu` free of the velocities at its end but for their mean: scheme
 for them.
 """
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._discrete import AbstractDerivative
+from .._discrete import AbstractCorrected, AbstractDerivative
 from .._kinematics import IdentityKinematics
-from .._linear import affine_root, as_dense, inverse_of, solve, Symmetric
+from .._linear import (
+    affine_root,
+    as_dense,
+    Assembled,
+    inverse_of,
+    row_hessians,
+    solve,
+    Symmetric,
+)
 from .._system import State, System
 from .._types import (
     Args,
@@ -27,6 +36,12 @@ from .._types import (
     Velocities,
 )
 from .base import AbstractModel, Drive, Increment, Scales
+from .elements import (
+    discrete_gradient_by_rows,
+    element_energies,
+    is_weight,
+    Summands,
+)
 
 
 class SeparableModel(AbstractModel):
@@ -37,10 +52,13 @@ class SeparableModel(AbstractModel):
     inertia: Symmetric
     inverse_inertia: Symmetric
     scales: Scales
+    # Asked of large systems only.
+    is_weight: bool = eqx.field(static=True)
 
     def __init__(self, system: System, state: State, args: Args):
         self.system = system
         self.args = args
+        self.is_weight = is_weight(system, state.q, args)
         self.inertia = system.inertia(state, args)
         self.inverse_inertia = inverse_of(self.inertia)
         self.scales = self._scales(state)
@@ -112,8 +130,19 @@ class SeparableModel(AbstractModel):
                 out = out + h * increment.velocity_impulse @ rate
             return out
 
-        impulse = derivative.gradient(action, a.q, b.q)
-        return Drive(impulse, jnp.zeros((0,), impulse.dtype))
+        none = jnp.zeros((0,), h.dtype)
+        energies = self._element_energies(a.q)
+        if energies is None or not isinstance(derivative, AbstractCorrected):
+            return Drive(derivative.gradient(action, a.q, b.q), none)
+        rows: list[Summands] = [lambda q, fn=fn: h * fn(q) for fn in energies]
+        rows += [lambda q: increment.impulse * self.constraint(q)]
+        if increment.velocity_impulse.size > 0:
+            eta = h * increment.velocity_impulse
+            rows += [lambda q: eta * self.joint_rate(q, mean_velocity)]
+        impulse = discrete_gradient_by_rows(derivative, rows, a.q, b.q)
+        if self.is_weight:
+            impulse = impulse + h * jax.grad(self._potential)(a.q)
+        return Drive(impulse, none)
 
     def structure(
         self, a: State, b: State, h: Scalar, rate: Coordinates, drive: Drive
@@ -166,9 +195,18 @@ class SeparableModel(AbstractModel):
 
     def stiffness(
         self, state: State, multipliers: Multipliers
-    ) -> tuple[Float[Array, "nq nq"], Float[Array, "nq nq"]]:
-        strain = jax.hessian(lambda q: self.strain(q, multipliers))
-        return strain(state.q), as_dense(self.inertia)
+    ) -> tuple[Float[Array, "nq nq"] | Assembled, Symmetric]:
+        energies = self._element_energies(state.q)
+        if energies is None:
+            strain = jax.hessian(lambda q: self.strain(q, multipliers))
+            return strain(state.q), as_dense(self.inertia)
+        of_constraints = lambda q: multipliers * self.constraint(q)
+        fns = [*energies, of_constraints]
+        return Assembled(tuple(row_hessians(fn, state.q) for fn in fns)), self.inertia
+
+    def _element_energies(self, q: Coordinates) -> list[Summands] | None:
+        """All of the potential of a large system that bends, if its elements are known."""
+        return [] if self.is_weight else element_energies(self.system, q, self.args)
 
     def strain(self, q: Coordinates, multipliers: Multipliers) -> Scalar:
         """`V + lambda . Phi`, the energy whose Hessian is the stiffness."""

@@ -4,13 +4,27 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._linear import cholesky, eigh, inverse
+from .._linear import as_dense, Assembled, cholesky, eigh, inverse, Symmetric
 
 
 def semidefinite_part(
+    stiffness: Float[Array, "nq nq"] | Assembled, inertia: Symmetric
+) -> Float[Array, "nq nq"] | Assembled:
+    """Positive semidefinite part in the metric of the inertia: independent of units.
+
+    Of an assembled stiffness the sum of those of its elements, each in the masses of its
+    coordinates.
+    """
+    if not isinstance(stiffness, Assembled):
+        return _dense_part(stiffness, as_dense(inertia))
+    masses = inertia.diagonal()
+    part = jax.vmap(lambda block, mass: _dense_part(block, jnp.diag(mass)))
+    return stiffness.map(lambda blocks, rows: part(blocks, masses[rows]))
+
+
+def _dense_part(
     stiffness: Float[Array, "nq nq"], inertia: Float[Array, "nq nq"]
 ) -> Float[Array, "nq nq"]:
-    """Positive semidefinite part in the metric of the inertia: independent of units."""
     root = cholesky(inertia)
     back = inverse(root)
     whole = back @ stiffness @ back.T

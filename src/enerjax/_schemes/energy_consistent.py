@@ -1,3 +1,5 @@
+from typing import TypeAlias
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -5,13 +7,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._discrete import AbstractDerivative, MeanValue
-from .._linear import inverse
+from .._linear import as_dense, Assembled, inverse, Symmetric
 from .._model import AbstractModel, CanonicalModel, Drive, Increment, SeparableModel
 from .._results import RESULTS
 from .._system import State
 from .._tracing import is_known
 from .._types import Coordinates, Multipliers, Real, Scalar, Velocities
-from ._decaying import alpha_from_spectral_radius, as_alpha
+from ._decaying import alpha_from_spectral_radius, as_alpha, JumpAndEnd
 from ._semidefinite import semidefinite_part
 from .base import (
     AbstractSingleSolve,
@@ -28,16 +30,21 @@ class _Frozen(eqx.Module):
     step: StepProblem
     # P = diag(K+, M^-1): the positive semidefinite part of the stiffness near the start,
     # and the inertia there.
-    stiffness: Float[Array, "nq nq"]
-    inertia: Float[Array, "nq nq"]
+    stiffness: Float[Array, "nq nq"] | Assembled
+    inertia: Symmetric
     compliance: Float[Array, "nq nq"]
-    # X = (M + lag^2 K+)^-1 (h/6) K+ with lag = alpha h/6: j_v = X (dq + lag dv).
+    # X = (M + lag^2 K+)^-1 (h/6) K+ with lag = alpha h/6: j_v = X (dq + lag dv). Empty
+    # where the stiffness is assembled: X would be full, so j_v is an unknown there.
     jump: Float[Array, "nq nq"]
     # (1 + lag X)^-1, where velocities are eliminated.
     damping: Float[Array, "nq nq"]
 
 
-class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
+# The end of the step, and where it is an unknown the jump, a velocity.
+_Unknowns: TypeAlias = Increment | JumpAndEnd
+
+
+class EnergyConsistent(AbstractSingleSolve[_Unknowns, _Frozen]):
     r"""One interval, order 4 or 3, and decay for any potential.
 
     The jump `j` of the discontinuous schemes in closed form, so that the unknowns are
@@ -56,7 +63,10 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
     - Conserves: energy, to round-off, at `alpha = 0`.
     - Dissipates: `alpha/2 j . P j >= 0` in every step, also where `V` is not convex. On a
       linear oscillator `rho_inf = (1 - alpha) / (1 + alpha)`. Where the stiffness has no
-      positive part there is nothing to damp, and nothing is removed.
+      positive part there is nothing to damp, and nothing is removed. (Of a system with
+      more than 64 coordinates whose potential is linear or made of `Elements`, `P` is the
+      sum of the positive parts of its elements and constraints; of any other the whole
+      matrix is decomposed, at a cost that grows with its cube.)
     - Constraints held at: position and velocity level.
     - Order: 4 at `alpha = 0` (then symmetric: `Composed` raises it to 6 or 8), else 3;
       2 where the `derivative` is no `MeanValue()` and `V` is not quadratic.
@@ -121,27 +131,49 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
         middle = State(start.q + 0.5 * h * model.lift(start.q, start.v), start.v)
         stiffness, inertia = model.stiffness(middle, multipliers)
         stiffness = semidefinite_part(stiffness, inertia)
-        lag = self._alpha(h) * h / 6
+        lag, none = self._alpha(h) * h / 6, jnp.zeros((0, 0), h.dtype)
+        if isinstance(stiffness, Assembled):
+            return _Frozen(step, stiffness, inertia, none, none, none)
+        inertia = as_dense(inertia)
         jump = inverse(inertia + lag**2 * stiffness) @ (h / 6 * stiffness)
         if isinstance(model, SeparableModel):
-            compliance = jnp.zeros((0, 0), h.dtype)
+            compliance = none
             damping = inverse(jnp.eye(start.q.size, dtype=h.dtype) + lag * jump)
         else:
             compliance = inverse(inertia)
-            damping = jnp.zeros((0, 0), h.dtype)
+            damping = none
         return _Frozen(step, stiffness, inertia, compliance, jump, damping)
 
     def predict(
         self, problem: _Frozen, acceleration: Velocities, multipliers: Multipliers
-    ) -> Increment:
-        return problem.step.guess(acceleration, multipliers)
+    ) -> _Unknowns:
+        guess = problem.step.guess(acceleration, multipliers)
+        if not isinstance(problem.stiffness, Assembled):
+            return guess
+        none = guess.momentum
+        return JumpAndEnd(Increment(jnp.zeros_like(guess.rate), none, none, none), guess)
 
-    def residual(self, z: Increment, problem: _Frozen) -> Increment:
+    def residual(self, z: _Unknowns, problem: _Frozen) -> _Unknowns:
+        if not isinstance(z, JumpAndEnd):
+            return self._rows(z, problem, *self._end(z, problem, None))
+        h, alpha = problem.step.h, self._alpha(problem.step.h)
+        end, jump_v = self._end(z.end, problem, z.jump.rate)
+        # (M + lag^2 P) j_v - (h/6) P (dq + lag dv)
+        dv = end.v - problem.step.start.v
+        pushed = problem.stiffness @ (
+            h * z.end.rate + alpha * h / 6 * (dv - alpha * jump_v)
+        )
+        jump_row = problem.inertia @ jump_v - h / 6 * pushed
+        jump_rows = eqx.tree_at(lambda rows: rows.rate, z.jump, jump_row)
+        return JumpAndEnd(jump_rows, self._rows(z.end, problem, end, jump_v))
+
+    def _rows(
+        self, z: Increment, problem: _Frozen, end: State, jump_v: Velocities
+    ) -> Increment:
         step, h = problem.step, problem.step.h
-        end, jump_v = self._end(z, problem)
         drive = step.drive(step.start, end, z)
         twist = self._twist(z, problem, end.v - step.start.v)
-        dissipation = h**2 / 12 * self._alpha(h) * problem.stiffness @ jump_v
+        dissipation = h**2 / 12 * self._alpha(h) * (problem.stiffness @ jump_v)
         impulse = drive.impulse - h / 12 * twist.impulse + dissipation
         drift = drive.drift
         if step.model.has_own_momenta:
@@ -149,12 +181,13 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
             drift = drift - h / 12 * twist.drift + 0.5 * (jump_v - undamped)
         return step.rows(z, end, Drive(impulse, drift))
 
-    def finish(self, z: Increment, problem: _Frozen) -> StepEnd:
+    def finish(self, z: _Unknowns, problem: _Frozen) -> StepEnd:
         step, h, alpha = problem.step, problem.step.h, self._alpha(problem.step.h)
-        end, jump_v = self._end(z, problem)
+        z, jump = (z.end, z.jump.rate) if isinstance(z, JumpAndEnd) else (z, None)
+        end, jump_v = self._end(z, problem, jump)
         dv = self._velocity(problem, end.v - step.start.v)
         jump_q = -h / 6 * (dv - alpha * jump_v)
-        size = jump_q @ problem.stiffness @ jump_q + jump_v @ problem.inertia @ jump_v
+        size = jump_q @ (problem.stiffness @ jump_q) + jump_v @ (problem.inertia @ jump_v)
         return StepEnd(
             end, h * z.rate, z.impulse / h, 0.5 * alpha * size, None, RESULTS.successful
         )
@@ -192,8 +225,10 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
         action = lambda q: h * model.strain(q, z.impulse / h)
         return jax.jvp(jax.grad(action), (q,), (x,))[1]
 
-    def _end(self, z: Increment, problem: _Frozen) -> tuple[State, Velocities]:
-        """The end of the step, and `j_v` of the dissipative jump."""
+    def _end(
+        self, z: Increment, problem: _Frozen, jump: Velocities | None
+    ) -> tuple[State, Velocities]:
+        """The end of the step, and `j_v` of the dissipative jump, where it is not given."""
         step, model, h = problem.step, problem.step.model, problem.step.h
         start, dq, lag = step.start, h * z.rate, self._alpha(h) * h / 6
         if not isinstance(model, SeparableModel):
@@ -205,11 +240,12 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
         curved = self._stiffness(z, model, h, start.q + 0.5 * dq, dq)
         # The upper half of the step equations, solved for the change of velocity; what
         # the dissipative jump adds to them depends on that change itself.
-        pushed = problem.jump @ dq
         right = (
             2 * (z.rate - start.v - reaction)
-            - model.inverse_inertia @ (curved - h * problem.stiffness @ dq) / 6
-            - pushed
+            - model.inverse_inertia @ (curved - h * (problem.stiffness @ dq)) / 6
         )
-        dv = problem.damping @ right
+        if jump is not None:
+            return State(q1, start.v + right - jump), jump
+        pushed = problem.jump @ dq
+        dv = problem.damping @ (right - pushed)
         return State(q1, start.v + dv), pushed + lag * problem.jump @ dv

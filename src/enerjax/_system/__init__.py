@@ -4,4 +4,5 @@ from .canonical import (
     HamiltonianSystem as HamiltonianSystem,
     LagrangianSystem as LagrangianSystem,
 )
+from .elements import Elements as Elements
 from .separable import System as System

@@ -1,0 +1,52 @@
+"""Large systems as sums over elements: rods, springs, any row of the constraints."""
+
+from collections.abc import Callable, Iterable
+from typing import TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._discrete import AbstractCorrected
+from .._linear import jacobian_pattern, LARGE, RowPattern
+from .._system import Elements, System
+from .._types import Args, Coordinates
+
+
+# A function whose entries are added up, each of a few coordinates.
+Summands: TypeAlias = Callable[[Coordinates], Float[Array, " elements"]]
+
+
+def is_weight(system: System, q: Coordinates, args: Args) -> bool:
+    """Whether the potential of a large system is linear, so that none of it bends."""
+    if q.size <= LARGE or isinstance(system.potential, Elements):
+        return False
+    bends = jacobian_pattern(jax.grad(lambda q: system.potential(q, args)), q)
+    return bends is not None and bends.nnz == 0
+
+
+def element_energies(system: System, q: Coordinates, args: Args) -> list[Summands] | None:
+    """What adds up to the potential of a large system, if it says so."""
+    potential = system.potential
+    if q.size <= LARGE or not isinstance(potential, Elements):
+        return None
+    return [lambda q, part=part: part.each(q, args) for part in potential.parts]
+
+
+def discrete_gradient_by_rows(
+    derivative: AbstractCorrected,
+    fns: Iterable[Summands],
+    a: Coordinates,
+    b: Coordinates,
+) -> Coordinates:
+    """The discrete gradient of a sum, each summand corrected by itself.
+
+    A correction along the whole increment would couple all bodies with each other.
+    """
+    total = jnp.zeros_like(a)
+    for fn in fns:
+        rows = RowPattern(fn, a)
+        gradients = lambda q, fn=fn, rows=rows: rows.derivative(fn, q)
+        by_row = derivative.gradients_of_rows(fn, gradients, rows.own, a, b)
+        total = total.at[rows.columns].add(by_row)
+    return total
