@@ -30,7 +30,7 @@ LAYERS = [
     {"_schemes", "_scaling", "_solution"},
     {"_check"},
     {"_solve"},
-    {"_step", "_initial", "_reverse"},
+    {"_step", "_initial", "_reverse", "_analysis"},
     {"_simulate", "problems"},
     {"_report"},
     {"__main__"},

@@ -1,6 +1,14 @@
 from importlib.metadata import version as _version
 
 from . import problems as problems
+from ._analysis import (
+    Equilibrium as Equilibrium,
+    equilibrium as equilibrium,
+    Mobility as Mobility,
+    mobility as mobility,
+    Modes as Modes,
+    modes as modes,
+)
 from ._audit import Audit as Audit
 from ._discrete import (
     AbstractDerivative as AbstractDerivative,

@@ -1,0 +1,116 @@
+"""What a mechanism can do in one pose: its freedoms, and constraints that repeat others."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float
+
+from .._check import check_system
+from .._linear import as_dense
+from .._model import AbstractModel, make_model
+from .._system import AbstractSystem, State
+from .._types import Args
+
+
+# Relative size below which a singular value counts as zero.
+_RANK = 1e-8
+# Residual, in parts of the size of a constraint, above which it is violated.
+_MET = 1e-6
+
+
+class Mobility(NamedTuple):
+    """The freedoms of a system in one pose; see `mobility`.
+
+    - `degrees_of_freedom`: independent velocities that the constraints admit.
+    - `rank`: of the constraints; `num_constraints` if they are independent.
+    - `num_constraints`: rows, joints first.
+    - `redundant`: numbers (or names) of rows that follow from the others.
+    - `inconsistent`: rows, redundant or not, that are violated in this pose and that no
+      small motion repairs together with the others.
+    - `singular_values`: of the constraints scaled to order one, descending. A small one
+      marks a pose close to a singular one.
+    - `velocities`: columns are independent rates of the coordinates, `(nq, dof)`,
+      orthonormal in the inertia.
+    """
+
+    degrees_of_freedom: int
+    rank: int
+    num_constraints: int
+    redundant: tuple
+    inconsistent: tuple
+    singular_values: Float[np.ndarray, " rank"]
+    velocities: Float[np.ndarray, "nq dof"]
+
+
+def mobility(
+    system: AbstractSystem,
+    state: State,
+    args: Args = None,
+    *,
+    names: Sequence[str] | None = None,
+) -> Mobility:
+    """Counts the freedoms of a mechanism, and finds the constraints that repeat others.
+
+    By the rank of `dPhi/dq` in the metric of the inertia, so that units do not matter. In
+    a singular pose, where constraints lose their independence for an instant, it counts
+    the freedoms of that instant.
+
+    **Arguments:**
+
+    - `system`, `state`, `args`: as for `simulate`. The constraints need not hold. Numbers,
+      not traced values.
+    - `names`: of the rows of the constraints, joints first; their numbers by default.
+
+    **Returns:** a `Mobility`.
+
+    **Raises:** `ValueError` for bad input, and for a wrong number of names.
+    """
+    state, args = check_system(system, state, args)
+    model = make_model(system, state, args)
+    scaled, root, residual = _scaled_constraints(model, state)
+    num_constraints, num_coordinates = scaled.shape
+    if names is None:
+        names = [str(k) for k in range(num_constraints)]
+        label = lambda rows: tuple(int(k) for k in sorted(rows))
+    else:
+        given = list(names)
+        if len(given) != num_constraints:
+            raise ValueError(
+                f"`mobility(names=...)`: {len(given)} names for {num_constraints} rows "
+                "of constraints."
+            )
+        label = lambda rows: tuple(given[k] for k in sorted(rows))
+    left, values, right = np.linalg.svd(scaled)
+    rank = int(np.sum(values > _RANK))
+    # Rows that span the others come first in a factorisation with pivoting.
+    _, _, order = scipy.linalg.qr(scaled.T, pivoting=True)
+    # What no motion can repair: the part of the residual outside of the range.
+    stuck = left[:, rank:] @ (left[:, rank:].T @ residual)
+    return Mobility(
+        num_coordinates - rank,
+        rank,
+        num_constraints,
+        label(order[rank:]),
+        label(np.nonzero(np.abs(stuck) > _MET)[0]),
+        values,
+        scipy.linalg.solve_triangular(root.T, right[rank:].T),
+    )
+
+
+def _scaled_constraints(
+    model: AbstractModel, state: State
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`dPhi/dq` in units of the constraints and the inertia, the root of the inertia, and
+    the residual in parts of the sizes of the constraints."""
+    inner = model.enter(state)
+    root = np.linalg.cholesky(np.asarray(as_dense(model.metric(inner))))
+    jacobian = np.asarray(jax.jacfwd(model.constraint)(state.q))
+    scaled = scipy.linalg.solve_triangular(root, jacobian.T, lower=True).T
+    lengths = np.linalg.norm(scaled, axis=1)
+    unit = np.where(lengths > 0, lengths, 1.0)
+    size = np.asarray(model.scales.constraint_size)
+    residual = np.asarray(model.constraint(state.q)) / np.where(size > 0, size, 1.0)
+    return scaled / unit[:, None], root, residual

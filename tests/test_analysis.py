@@ -1,0 +1,154 @@
+"""Equilibria, vibrations about them, and the freedoms of mechanisms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.special import jn_zeros
+
+import enerjax as ej
+
+from .helpers import problem
+
+
+def _sagging(num_links, span):
+    """A chain of unit weight and length between two points, and a guess of its shape."""
+    length = 1 / num_links
+    anchors = jnp.array([[0.0, 0.0], [span, 0.0]])
+
+    def rods(q, args):
+        points = jnp.concatenate([anchors[:1], q.reshape(-1, 2), anchors[1:]])
+        return jnp.sum(jnp.diff(points, axis=0) ** 2, axis=1) - args["l"] ** 2
+
+    system = ej.System(
+        lambda v, args: 0.5 * args["m"] * v @ v,
+        lambda q, args: -args["m"] * 9.81 * jnp.sum(q[1::2]),
+        rods,
+    )
+    x = np.linspace(0, span, num_links + 1)[1:-1]
+    guess = np.stack([x, 1.2 * x * (span - x)], axis=1).ravel()
+    args = {"m": jnp.asarray(1 / num_links), "l": jnp.asarray(length)}
+    return system, ej.State(guess, np.zeros(guess.size)), args
+
+
+def _polygon(num_links, span):
+    """Closed form: horizontal tension is constant, slopes grow by a weight a joint."""
+    length, weight = 1 / num_links, 9.81 / num_links
+    steps = np.arange(num_links) - (num_links - 1) / 2
+    slopes = lambda tension: -steps * weight / tension
+    width = lambda tension: np.sum(length / np.sqrt(1 + slopes(tension) ** 2)) - span
+    tension = brentq(width, 1e-3, 1e3, xtol=1e-15)
+    x = length / np.sqrt(1 + slopes(tension) ** 2)
+    rods = np.stack([x, x * slopes(tension)], axis=1)
+    return np.cumsum(rods, axis=0)[:-1].ravel()
+
+
+def test_a_hanging_chain_rests_in_the_catenary_polygon():
+    system, guess, args = _sagging(12, 0.6)
+    found = ej.equilibrium(system, guess, args)
+    np.testing.assert_allclose(found.state.q, _polygon(12, 0.6), atol=1e-12)  # solver
+    assert np.all(found.state.v == 0)
+    # Its derivative along a change of the lengths, by differences.
+    sag = lambda l: ej.equilibrium(system, guess, args | {"l": l}).state.q[11]
+    step, l = 1e-5, args["l"]
+    change = (sag(l + step) - sag(l - step)) / (2 * step)
+    assert jax.grad(sag)(l) == pytest.approx(float(change), rel=1e-7)  # truncation
+    assert jax.jvp(sag, (l,), (1.0,))[1] == pytest.approx(float(change), rel=1e-7)
+
+
+def test_no_equilibrium_is_told():
+    system, start, args = problem("particles")
+    free = ej.System(system.kinetic, lambda q, args: q[1])
+    with pytest.raises(ValueError, match="No equilibrium was found"):
+        ej.equilibrium(free, start, args)
+
+
+def test_modes_of_a_hanging_chain():
+    """Transverse modes are those of a string of beads, in the limit Bessel's."""
+    num_links = 40
+    system, _, args = ej.problems.chain(num_links)
+    length = 1 / num_links
+    hanging = np.stack([np.zeros(num_links), length * np.arange(1, num_links + 1)], axis=1)
+    rest = ej.State(hanging.ravel(), np.zeros(2 * num_links))
+    found = ej.modes(system, rest, args)
+    assert found.eigenvalues.shape == (num_links,)
+    # Tension below bead k, of the n-k beads there: m x'' = T_k (x_k-1 - x_k) / l ...
+    tension = 9.81 * np.arange(num_links, 0, -1) / length
+    matrix = np.diag(tension + np.append(tension[1:], 0)) - np.diag(tension[1:], 1)
+    matrix -= np.diag(tension[1:], -1)
+    np.testing.assert_allclose(found.eigenvalues, np.linalg.eigvalsh(matrix), rtol=1e-10)
+    string = jn_zeros(0, 3) / 2 * np.sqrt(9.81)
+    np.testing.assert_allclose(found.frequencies[:3], string, rtol=0.05)  # of order 1/N
+    gram = found.shapes @ found.shapes.T / num_links
+    np.testing.assert_allclose(gram, np.eye(num_links), atol=1e-10)
+    # Frequencies go with the root of gravity.
+    first = lambda g: ej.modes(system, rest, args | {"g": g}).frequencies[0]
+    assert jax.grad(first)(9.81) == pytest.approx(float(first(9.81)) / 9.81 / 2, rel=1e-9)
+
+
+def test_modes_of_a_ring_of_springs():
+    """Masses on a line ring of linear springs: 2 sqrt(k/m) sin(pi j / n)."""
+    n, k, m = 9, 7.0, 0.3
+    system = ej.System(
+        m * np.eye(n), lambda q, args: 0.5 * k * jnp.sum((jnp.roll(q, 1) - q) ** 2)
+    )
+    found = ej.modes(system, ej.State(np.zeros(n), np.zeros(n)))
+    j = np.array([0, 1, 1, 2, 2, 3, 3, 4, 4])
+    exact = 4 * k / m * np.sin(np.pi * j / n) ** 2
+    np.testing.assert_allclose(found.eigenvalues, exact, atol=1e-12 * k / m * n)
+
+
+def test_a_pendulum_on_its_head_is_unstable():
+    system, _, args = problem("pendulum")
+    growth = []
+    for y in (1.0, -1.0):
+        found = ej.equilibrium(system, ej.State([0.01, y], [0.0, 0.0]), args)
+        growth.append(float(ej.modes(system, found.state, args).frequencies[0]))
+    np.testing.assert_allclose(growth, [np.sqrt(9.81), -np.sqrt(9.81)], rtol=1e-12)
+
+
+def _parallelogram(offset=0.0):
+    """Four bars and a fifth that repeats the others where it is parallel."""
+
+    def bars(q, args):
+        left, right = q[:2], q[2:]
+        middle = 0.5 * (left + right)
+        return jnp.array(
+            [
+                left @ left - 1,
+                (right - jnp.array([2.0, 0.0])) @ (right - jnp.array([2.0, 0.0])) - 1,
+                (right - left) @ (right - left) - 4,
+                (middle - jnp.array([1.0, 0.0])) @ (middle - jnp.array([1.0, 0.0]))
+                - (1 + offset),
+            ]
+        )
+
+    system = ej.System(np.eye(4), lambda q, args: 9.81 * (q[1] + q[3]), bars)
+    up = np.array([np.cos(1.0), np.sin(1.0)])
+    return system, ej.State(np.concatenate([up, up + [2, 0]]), np.zeros(4))
+
+
+def test_mobility_of_an_over_constrained_loop():
+    system, pose = _parallelogram()
+    found = ej.mobility(system, pose, names=["left", "right", "coupler", "middle"])
+    assert (found.degrees_of_freedom, found.rank, found.num_constraints) == (1, 3, 4)
+    assert len(found.redundant) == 1
+    assert found.inconsistent == ()
+    velocity = found.velocities[:, 0]
+    exact = np.tile([-np.sin(1.0), np.cos(1.0)], 2) / np.sqrt(2)
+    np.testing.assert_allclose(np.abs(velocity @ exact), 1, rtol=1e-12)
+    system, pose = _parallelogram(offset=0.1)
+    found = ej.mobility(system, pose)
+    assert 3 in found.inconsistent
+    with pytest.raises(ValueError, match="2 names for 4 rows"):
+        ej.mobility(system, pose, names=["a", "b"])
+
+
+def test_mobility_in_a_singular_pose():
+    """Flat, the parallelogram can also fold into a crossed one."""
+    system, pose = _parallelogram()
+    flat = ej.State([1.0, 0.0, 3.0, 0.0], np.zeros(4))
+    assert ej.mobility(system, flat).degrees_of_freedom == 2
+    assert ej.mobility(system, pose).degrees_of_freedom == 1
+    assert ej.mobility(*problem("top")).degrees_of_freedom == 3
