@@ -159,3 +159,32 @@ def test_lanes_that_finish_early_do_not_move():
         alone = run(tuple(x[k] for x in numbers))
         difference = np.abs(iterations[k] - alone.stats.newton_iterations)
         assert np.max(difference) <= 1
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_large_batch_with_a_broken_lane(bad):
+    """Reductions over many lanes are other programs: they must not overlook a NaN."""
+    count, steps = 1500, 3
+    args = problem("double").args
+    start = problem("double").start
+
+    def end(g, h):
+        run = ej.simulate(
+            problem("double").system,
+            ej.EnergyPreserving(),
+            start,
+            args | dict(g=g),
+            h=h,
+            num_steps=steps,
+            throw=False,
+        )
+        return run.ys.q[-1], run.stats.completed_steps
+
+    g = jnp.linspace(5.0, 15.0, count).at[700].set(bad)
+    h = jnp.linspace(1e-3, 2e-3, count)
+    q, completed = jax.jit(jax.vmap(end))(g, h)
+    healthy = np.arange(count) != 700
+    np.testing.assert_array_equal(completed, np.where(healthy, steps, 0))
+    np.testing.assert_array_equal(np.isfinite(q).all(axis=1), healthy)
+    for lane in (0, 699, count - 1):
+        np.testing.assert_allclose(q[lane], jax.jit(end)(g[lane], h[lane])[0], **SAME)

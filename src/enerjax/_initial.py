@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._check import check_system
-from ._linear import affine_root, Symmetric
+from ._linear import affine_root, largest, Symmetric
 from ._model import AbstractModel, make_model
 from ._newton import Newton
 from ._root import find_root
@@ -151,7 +151,7 @@ def _rank(model: AbstractModel, q: Coordinates) -> Count:
     probe = jnp.cos(jnp.arange(num_constraints, dtype=q.dtype))
     image = product(probe)
     again = affine_root(lambda mu: product(mu) - image, probe)
-    found = jnp.max(jnp.abs(again - probe)) <= jnp.finfo(q.dtype).eps ** 0.25
+    found = largest(again - probe) <= jnp.finfo(q.dtype).eps ** 0.25
     return num_constraints - 1 + found.astype(int)
 
 
@@ -161,7 +161,7 @@ def _project_position(model: AbstractModel, state: State) -> tuple[Coordinates, 
     if model.constraint(guess).size == 0:
         return guess, jnp.array(True)
     metric, scales = model.metric(model.enter(state)), model.scales
-    size = jnp.max(jnp.abs(guess) * scales.coordinate)
+    size = largest(guess * scales.coordinate)
     size = jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
 
     def conditions(x, inputs):
@@ -180,7 +180,7 @@ def _project_position(model: AbstractModel, state: State) -> tuple[Coordinates, 
     root = find_root(conditions, Newton(), zero, inputs, max_iterations=50)
     x, found = root.value, root.found
     # Constraints that are met are not far; whether they are independent is told apart.
-    met = jnp.max(jnp.abs(conditions(zero, inputs)[1])) <= tolerance
+    met = largest(conditions(zero, inputs)[1]) <= tolerance
     near = met | (found & _linear(model, metric, guess))
     q = jnp.where(met & ~found, guess, guess + size * x[0] / scales.coordinate)
     return q, near

@@ -7,13 +7,13 @@ import lineax as lx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from ._linear import AbstractFactors, KLU, Linearisable
+from ._linear import AbstractFactors, KLU, largest, Linearisable
 from ._types import Count, Flag, Scalar
 
 
 def max_norm(x: PyTree[Array]) -> Scalar:
     """The largest entry; for all residuals and corrections here are of order one."""
-    return jnp.max(jnp.abs(ravel_pytree(x)[0]), initial=0.0)
+    return largest(ravel_pytree(x)[0])
 
 
 class Newton(eqx.Module):
@@ -116,7 +116,7 @@ def newton_iterations(
         x = before.x - correction
         # Each unknown against itself: one scale for all would hide a light, slow body
         # beside a heavy, fast one. The floor is for unknowns that pass through zero.
-        size = jnp.max(jnp.abs(correction) / (jnp.abs(x) + eps**0.125), initial=0.0)
+        size = largest(correction / (jnp.abs(x) + eps**0.125))
         defect, contraction = max_norm(value), size / before.size
         small = size <= eps**0.25
         shrinks = contraction < _SHRINKS

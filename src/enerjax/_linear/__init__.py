@@ -25,5 +25,6 @@ from .jacobian import (
     linearisable as linearisable,
     RowPattern as RowPattern,
 )
+from .norms import largest as largest
 from .pattern import jacobian_pattern as jacobian_pattern, LARGE as LARGE
 from .symmetric import cholesky as cholesky, eigh as eigh

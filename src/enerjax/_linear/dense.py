@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .._types import Flag, Scalar
+from .norms import largest
 
 
 # Rows up to which plain operations beat LAPACK.
@@ -179,4 +180,4 @@ def _product(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n 
 
 
 def _row_sum(matrix: Float[Array, "n n"]) -> Scalar:
-    return jnp.max(jnp.sum(jnp.abs(matrix), axis=1))
+    return largest(jnp.sum(jnp.abs(matrix), axis=1))

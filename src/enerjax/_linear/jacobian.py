@@ -143,10 +143,11 @@ class RowPattern:
     ) -> Float[Array, "m ... width"]:
         """Of a function with such rows, `(m, ...)`; zeros where the rows are short."""
         products = coloured_products(fn, x, self._colours)
-        numbers = np.arange(self.columns.shape[0])
+        num_rows, width = self.columns.shape
+        numbers = np.arange(num_rows)
         entries = products[self._colours[self.columns], numbers[:, None]]
         entries = jnp.moveaxis(entries, 1, -1)
-        shape = (numbers.size, *[1] * (entries.ndim - 2), -1)
+        shape = (num_rows, *[1] * (entries.ndim - 2), width)
         return entries * jnp.asarray(self._filled, x.dtype).reshape(shape)
 
 
