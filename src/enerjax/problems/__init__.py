@@ -5,6 +5,12 @@ Units are SI. In the plane gravity acts along +y; in space along -z.
 """
 
 from ._base import Problem as Problem
+from ._particles import (
+    fput as fput,
+    henon_heiles as henon_heiles,
+    kepler as kepler,
+    pleiades as pleiades,
+)
 from ._pendulums import (
     chain as chain,
     double_pendulum as double_pendulum,
