@@ -101,7 +101,7 @@ def solve(
             state,
             jnp.sum(ends.displacement, axis=0),
             jnp.mean(ends.multipliers, axis=0),
-            jnp.sum(ends.dissipated),
+            *jax.tree.map(jnp.sum, (ends.dissipated, ends.work, ends.drive_work)),
             jax.tree.map(lambda x: x[-1], ends.details),
             first_of(ends.result),
         )
@@ -171,6 +171,6 @@ def _free_flight(
     scheme: AbstractSingleSolve, problem: Any, model: AbstractModel, start: State
 ) -> PyTree[Any]:
     """The unknowns of a step in which no force acts."""
-    num_constraints = jax.eval_shape(model.constraint, start.q).shape[0]
+    num_constraints = jax.eval_shape(model.constraint, start.q, start.t).shape[0]
     no_force = jnp.zeros((num_constraints,), start.q.dtype)
     return scheme.predict(problem, jnp.zeros_like(start.v), no_force)

@@ -6,6 +6,7 @@ positions and momenta,
 
     psi_b - psi_a = [D_q (C v_m)] (q_b - q_a) + 1/2 (C_a + C_b) (v_b - v_a),
 
+(with `D_q` over positions and time where constraints are driven, and `psi` affine in `v`)
 which leaves `S_mu` free of the velocities at its end but for their mean: schemes solve it
 for them.
 """
@@ -26,7 +27,9 @@ from .._types import (
     Scalar,
     Velocities,
 )
-from .base import AbstractModel, Drive, Increment, Scales
+from .base import AbstractModel
+from .interval import Drive, Increment, lapse_of, Scales, Time
+from .lapse import gradient_and_work
 
 
 class SeparableModel(AbstractModel):
@@ -80,12 +83,22 @@ class SeparableModel(AbstractModel):
             return jnp.zeros((0,), q.dtype)
         return self.system.coordinate_constraint(q, self.args)
 
-    def constraint(self, q: Coordinates) -> Multipliers:
-        return jnp.concatenate([self.joint(q), self.coordinate(q)])
+    def constraint(self, q: Coordinates, t: Time) -> Multipliers:
+        return jnp.concatenate([self.joint(q, t), self.coordinate(q)])
+
+    def slope(self, state: State) -> Coordinates:
+        slope = jax.grad(self._potential)(state.q)
+        force = self.force(state.q, state.v, state.t)
+        return slope if force is None else slope - self._pull(state.q, force)
+
+    def velocity(self, state: State) -> Velocities:
+        return state.v
 
     def push(self, qa: Coordinates, qb: Coordinates, rate: Coordinates) -> Velocities:
-        """`Lm rate`"""
         return self.system.kinematics.push(0.5 * (qa + qb), rate, self.args)
+
+    def pull(self, qa: Coordinates, qb: Coordinates, force: Velocities) -> Coordinates:
+        return self._pull(0.5 * (qa + qb), force)
 
     def _pull(self, q: Coordinates, momentum: Velocities) -> Coordinates:
         return self.system.kinematics.pull(q, momentum, self.args)
@@ -102,18 +115,25 @@ class SeparableModel(AbstractModel):
         increment: Increment,
     ) -> Drive:
         mean_velocity = 0.5 * (a.v + b.v)
+        fixed, driven = self.split(increment)
 
         def action(q: Coordinates) -> Scalar:
             out = h * self._potential(q)
-            if increment.impulse.size > 0:
-                out = out + increment.impulse @ self.constraint(q)
-            if increment.velocity_impulse.size > 0:
-                rate = self.joint_rate(q, mean_velocity)
-                out = out + h * increment.velocity_impulse @ rate
+            if fixed.impulse.size > 0:
+                constraint = jnp.concatenate([self.fixed(q), self.coordinate(q)])
+                out = out + fixed.impulse @ constraint
+            if fixed.velocity_impulse.size > 0:
+                _, rate = jax.jvp(self.fixed, (q,), (self.lift(q, mean_velocity),))
+                out = out + h * fixed.velocity_impulse @ rate
             return out
 
-        impulse = derivative.gradient(action, a.q, b.q)
-        return Drive(impulse, jnp.zeros((0,), impulse.dtype))
+        def moved(q: Coordinates, t: Time) -> Scalar:
+            return self.driven_action(q, self.lift(q, mean_velocity), t, h, driven)
+
+        moved = None if self.system.driven is None else moved
+        ends = ((x.q, x.t) for x in (a, b))
+        impulse, work = gradient_and_work(derivative, action, moved, *ends)
+        return Drive(impulse, jnp.zeros((0,), impulse.dtype), work)
 
     def structure(
         self, a: State, b: State, h: Scalar, rate: Coordinates, drive: Drive
@@ -129,21 +149,25 @@ class SeparableModel(AbstractModel):
         return Drive(change + drive.impulse, drive.drift)
 
     def reaction(self, state: State, eta: JointMultipliers) -> Velocities:
-        return self.reaction_at(state.q, eta)
+        return self.reaction_at(state.q, state.t, eta)
 
-    def reaction_at(self, q: Coordinates, eta: JointMultipliers) -> Velocities:
-        """`M^-1 C(q)^T eta`; as `psi` is linear in `v`, the same for every `v`."""
+    def reaction_at(self, q: Coordinates, t: Time, eta: JointMultipliers) -> Velocities:
+        """`M^-1 C(q, t)^T eta`; as `psi` is affine in `v`, the same for every `v`."""
         rest = jnp.zeros((self.inertia.shape[0],), q.dtype)
         if eta.size == 0:
             return rest
-        _, transpose = jax.vjp(lambda v: self.joint_rate(q, v), rest)
+        _, transpose = jax.vjp(lambda v: self.joint_change(q, v, t), rest)
         return self.inverse_inertia @ transpose(eta)[0]
 
     def mean_reaction(
-        self, qa: Coordinates, qb: Coordinates, eta: JointMultipliers
+        self, qa: Coordinates, ta: Time, qb: Coordinates, tb: Time, eta: JointMultipliers
     ) -> Velocities:
         """`D_mu (eta . psi) = 1/2 M^-1 (C_a + C_b)^T eta`"""
-        return 0.5 * (self.reaction_at(qa, eta) + self.reaction_at(qb, eta))
+        return 0.5 * (self.reaction_at(qa, ta, eta) + self.reaction_at(qb, tb, eta))
+
+    def joint_change(self, q: Coordinates, v: Velocities, t: Time) -> JointMultipliers:
+        """`C(q, t) v`, the part of `psi` that is linear in `v`."""
+        return jax.jvp(lambda q: self.joint(q, t), (q,), (self.lift(q, v),))[1]
 
     def metric(self, state: State) -> Symmetric:
         """The inertia in the coordinates, made regular where they are redundant.
@@ -167,33 +191,33 @@ class SeparableModel(AbstractModel):
     def stiffness(
         self, state: State, multipliers: Multipliers
     ) -> tuple[Float[Array, "nq nq"], Float[Array, "nq nq"]]:
-        strain = jax.hessian(lambda q: self.strain(q, multipliers))
+        strain = jax.hessian(lambda q: self.strain(q, state.t, multipliers))
         return strain(state.q), as_dense(self.inertia)
 
-    def strain(self, q: Coordinates, multipliers: Multipliers) -> Scalar:
+    def strain(self, q: Coordinates, t: Time, multipliers: Multipliers) -> Scalar:
         """`V + lambda . Phi`, the energy whose Hessian is the stiffness."""
-        return self._potential(q) + multipliers @ self.constraint(q)
+        return self._potential(q) + multipliers @ self.constraint(q, t)
 
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
         """The constraints enter twice differentiated; coordinate constraints have no
         acceleration level of their own (their multipliers close the `nq` rows).
         """
-        q, v, scales = state.q, state.v, self.scales
+        q, v, t, scales = state.q, state.v, state.t, self.scales
         qdot = self.lift(q, v)
-        force = jax.grad(self._potential)(q)
+        slope = self.slope(state)
         gyroscopic = self.system.kinematics.gyroscopic(q, self.inertia @ v, qdot, self.args)
         if gyroscopic is not None:
-            force = force + gyroscopic
-        _, drift = jax.jvp(lambda x: self.joint_rate(x, v), (q,), (qdot,))
-        _, transpose = jax.vjp(self.constraint, q)
+            slope = slope + gyroscopic
+        drift = self._drift(state, qdot)
+        _, transpose = jax.vjp(lambda x: self.constraint(x, t), q)
         unit = 1 / jnp.sqrt(self.inertia.diagonal())
 
         def conditions(x: Array) -> Array:
             acceleration, multipliers = unit * x[: v.size], x[v.size :] / scales.constraint
             pulled = self._pull(q, self.inertia @ acceleration) + transpose(multipliers)[0]
-            rate = self.joint_rate(q, acceleration) + drift
+            rate = self.joint_change(q, acceleration, t) + drift
             rows = (
-                (pulled + force) / scales.coordinate,
+                (pulled + slope) / scales.coordinate,
                 rate / scales.constraint[: rate.size],
             )
             return jnp.concatenate(rows)
@@ -201,15 +225,19 @@ class SeparableModel(AbstractModel):
         x = affine_root(conditions, jnp.zeros((v.size + scales.constraint.size,), q.dtype))
         return unit * x[: v.size], x[v.size :] / scales.constraint
 
+    def _drift(self, state: State, qdot: Coordinates) -> JointMultipliers:
+        """What `dpsi/dt` is without acceleration."""
+        rates = lambda q, t: self.joint_rate(q, state.v, t)
+        return jax.jvp(rates, (state.q, state.t), (qdot, lapse_of(state.t)))[1]
+
     def multipliers(self, state: State) -> Multipliers:
         """By the constraints alone where `L = I`: a smaller matrix."""
         inverse_inertia = self.inverse_inertia
         if not self.has_canonical_rates or not isinstance(inverse_inertia, Array):
             return self.accelerations(state)[1]
-        q, v = state.q, state.v
-        rows = jax.jacfwd(self.constraint)(q) / self.scales.constraint[:, None]
-        _, drift = jax.jvp(lambda x: self.joint_rate(x, v), (q,), (v,))
-        push = inverse_inertia @ jax.grad(self._potential)(q)
-        right = drift / self.scales.constraint - rows @ push
+        rows = jax.jacfwd(self.constraint)(state.q, state.t)
+        rows = rows / self.scales.constraint[:, None]
+        push = inverse_inertia @ self.slope(state)
+        right = self._drift(state, state.v) / self.scales.constraint - rows @ push
         mobility = rows @ inverse_inertia @ rows.T
         return solve(mobility, right) / self.scales.constraint

@@ -6,7 +6,14 @@ from jaxtyping import Array, Float
 
 from .._discrete import AbstractDerivative, MeanValue
 from .._linear import inverse
-from .._model import AbstractModel, CanonicalModel, Drive, Increment, SeparableModel
+from .._model import (
+    AbstractModel,
+    CanonicalModel,
+    Drive,
+    Increment,
+    SeparableModel,
+    Time,
+)
 from .._results import RESULTS
 from .._system import State
 from .._tracing import is_known
@@ -118,7 +125,8 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
         # so the multipliers of the start serve. Inside the solve it would cost an
         # eigenvalue problem per iteration.
         multipliers = model.multipliers(start)
-        middle = State(start.q + 0.5 * h * model.lift(start.q, start.v), start.v)
+        half_way = start.q + 0.5 * h * model.lift(start.q, start.v)
+        middle = State(half_way, start.v, step.middle_time)
         stiffness, inertia = model.stiffness(middle, multipliers)
         stiffness = semidefinite_part(stiffness, inertia)
         lag = self._alpha(h) * h / 6
@@ -139,7 +147,7 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
     def residual(self, z: Increment, problem: _Frozen) -> Increment:
         step, h = problem.step, problem.step.h
         end, jump_v = self._end(z, problem)
-        drive = step.drive(step.start, end, z)
+        drive = step.drive(step.start, end, z).less(step.load(step.start, end, z))
         twist = self._twist(z, problem, end.v - step.start.v)
         dissipation = h**2 / 12 * self._alpha(h) * problem.stiffness @ jump_v
         impulse = drive.impulse - h / 12 * twist.impulse + dissipation
@@ -155,8 +163,21 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
         dv = self._velocity(problem, end.v - step.start.v)
         jump_q = -h / 6 * (dv - alpha * jump_v)
         size = jump_q @ problem.stiffness @ jump_q + jump_v @ problem.inertia @ jump_v
+        load, drive_work = (
+            step.load(step.start, end, z), step.drive_work(step.start, end, z)
+        )
+        if drive_work is not None:
+            twist = self._twist(z, problem, end.v - step.start.v)
+            drive_work = drive_work - h / 12 * twist.work
         return StepEnd(
-            end, h * z.rate, z.impulse / h, 0.5 * alpha * size, None, RESULTS.successful
+            end,
+            h * z.rate,
+            z.impulse / h,
+            0.5 * alpha * size,
+            None if load is None else load @ z.rate,
+            drive_work,
+            None,
+            RESULTS.successful,
         )
 
     def _alpha(self, h: Scalar) -> Scalar:
@@ -170,39 +191,49 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
         """`D J D (z1 - z0)`, `h` times in the first part, with `D` at the midpoint.
 
         It is orthogonal to `z1 - z0`, so it does no work. Where velocities are eliminated
-        only the first part is needed: `h K dv`.
+        only the first part is needed: `h K dv`. Where time enters it is a coordinate,
+        whose momentum nothing depends on.
         """
         step, model, h = problem.step, problem.step.model, problem.step.h
-        middle = step.start.q + 0.5 * h * z.rate
+        middle, t = step.start.q + 0.5 * h * z.rate, step.middle_time
+        no_lapse = jax.tree.map(jnp.zeros_like, t)
         if isinstance(model, SeparableModel):
-            return Drive(self._stiffness(z, model, h, middle, dv), dv[:0])
+            force, power = self._stiffness(z, problem, (dv, no_lapse))
+            return Drive(force, dv[:0], power)
         assert isinstance(model, CanonicalModel)
-        action = lambda q, p: h * model.hamiltonian(q, p) + z.impulse @ model.constraint(q)
-        forces = jax.grad(action, argnums=(0, 1))
-        at = middle, step.start.v + 0.5 * dv
+
+        def action(q: Coordinates, p: Velocities, t: Time) -> Scalar:
+            return h * model.hamiltonian(q, p) + z.impulse @ model.constraint(q, t)
+
+        forces = jax.grad(action, argnums=(0, 1, 2))
+        at = middle, step.start.v + 0.5 * dv, t
         # h D: one factor h remains in the second product, and is divided out for `w_mu`.
-        _, (force, rate) = jax.jvp(forces, at, (h * z.rate, dv))
-        _, (force, rate) = jax.jvp(forces, at, (rate / h, -force / h))
-        return Drive(force, rate / h)
+        _, (force, rate, _) = jax.jvp(forces, at, (h * z.rate, dv, step.lapse))
+        _, (force, rate, power) = jax.jvp(forces, at, (rate / h, -force / h, no_lapse))
+        return Drive(force, rate / h, power)
 
     def _stiffness(
-        self, z: Increment, model: SeparableModel, h: Scalar, q: Coordinates, x: Coordinates
-    ) -> Coordinates:
-        """`h K x` at `q`."""
-        action = lambda q: h * model.strain(q, z.impulse / h)
-        return jax.jvp(jax.grad(action), (q,), (x,))[1]
+        self, z: Increment, problem: _Frozen, along: tuple[Coordinates, Time]
+    ) -> tuple[Coordinates, Time]:
+        """`h K` at the midpoint times a vector, with its row and column of time."""
+        step = problem.step
+        model, h = step.model, step.h
+        assert isinstance(model, SeparableModel)
+        middle = step.start.q + 0.5 * h * z.rate, step.middle_time
+        action = lambda q, t: h * model.strain(q, t, z.impulse / h)
+        return jax.jvp(jax.grad(action, argnums=(0, 1)), middle, along)[1]
 
     def _end(self, z: Increment, problem: _Frozen) -> tuple[State, Velocities]:
         """The end of the step, and `j_v` of the dissipative jump."""
         step, model, h = problem.step, problem.step.model, problem.step.h
         start, dq, lag = step.start, h * z.rate, self._alpha(h) * h / 6
         if not isinstance(model, SeparableModel):
-            end = step.node(z)
+            end = step.node(z, step.end_time)
             dv = self._velocity(problem, end.v - start.v)
             return end, problem.jump @ (dq + lag * dv)
-        q1 = step.at(z)
-        reaction = model.mean_reaction(start.q, q1, z.velocity_impulse)
-        curved = self._stiffness(z, model, h, start.q + 0.5 * dq, dq)
+        q1, t1 = step.at(z), step.end_time
+        reaction = model.mean_reaction(start.q, start.t, q1, t1, z.velocity_impulse)
+        curved, _ = self._stiffness(z, problem, (dq, step.lapse))
         # The upper half of the step equations, solved for the change of velocity; what
         # the dissipative jump adds to them depends on that change itself.
         pushed = problem.jump @ dq
@@ -212,4 +243,4 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
             - pushed
         )
         dv = problem.damping @ right
-        return State(q1, start.v + dv), pushed + lag * problem.jump @ dv
+        return State(q1, start.v + dv, t1), pushed + lag * problem.jump @ dv

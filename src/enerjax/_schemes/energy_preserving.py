@@ -64,14 +64,19 @@ class EnergyPreserving(AbstractSingleSolve[Increment, StepProblem]):
     def residual(self, z: Increment, problem: StepProblem) -> Increment:
         end = self._end(z, problem)
         drive = problem.drive(problem.start, end, z)
-        return problem.rows(z, end, drive)  # eq. (14a, c)
+        load = problem.load(problem.start, end, z)
+        return problem.rows(z, end, drive.less(load))  # eq. (14a, c)
 
     def finish(self, z: Increment, problem: StepProblem) -> StepEnd:
+        end = self._end(z, problem)
+        load = problem.load(problem.start, end, z)
         return StepEnd(
-            self._end(z, problem),
+            end,
             problem.h * z.rate,
             z.impulse / problem.h,
             jnp.zeros_like(problem.h),
+            None if load is None else load @ z.rate,
+            problem.drive_work(problem.start, end, z),
             None,
             RESULTS.successful,
         )
@@ -79,9 +84,9 @@ class EnergyPreserving(AbstractSingleSolve[Increment, StepProblem]):
     def _end(self, z: Increment, problem: StepProblem) -> State:
         model, start = problem.model, problem.start
         if not isinstance(model, SeparableModel):
-            return problem.node(z)
-        q1 = problem.at(z)
+            return problem.node(z, problem.end_time)
+        q1, t1 = problem.at(z), problem.end_time
         # eq. (14b), solved for the velocity
-        mean = model.push(start.q, q1, z.rate)
-        mean = mean - model.mean_reaction(start.q, q1, z.velocity_impulse)
-        return State(q1, 2 * mean - start.v)
+        mean = problem.velocity(z)
+        mean = mean - model.mean_reaction(start.q, start.t, q1, t1, z.velocity_impulse)
+        return State(q1, 2 * mean - start.v, t1)
