@@ -5,6 +5,7 @@ Units are SI. In the plane gravity acts along +y; in space along -z.
 """
 
 from ._base import Problem as Problem
+from ._driven import car_axis as car_axis
 from ._pendulums import (
     chain as chain,
     double_pendulum as double_pendulum,
