@@ -65,7 +65,7 @@ class AbstractModel(eqx.Module):
 
     @abc.abstractmethod
     def leave(self, state: State) -> State:
-        """A state of the schemes as the user has it."""
+        """A state of the schemes as the user has it, without its time."""
 
     @abc.abstractmethod
     def kinetic(self, state: State) -> Scalar: ...

@@ -60,7 +60,7 @@ class SeparableModel(AbstractModel):
         return state
 
     def leave(self, state: State) -> State:
-        return state
+        return State(state.q, state.v)
 
     def kinetic(self, state: State) -> Scalar:
         return self.kinetic_of(state.v)
