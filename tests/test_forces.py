@@ -102,9 +102,7 @@ def test_a_damper_never_creates_energy_however_long_the_step(scheme):
 def test_the_work_of_a_damper_in_a_decaying_step_is_a_sum_of_squares(alpha):
     h, q0, v0 = 0.7, 1.0, 0.3
     args = dict(k=4.0, c=0.8)
-    out = ej.step(
-        DAMPED, ej.EnergyDecaying(alpha), ej.State([q0], [v0]), args, h=h
-    )
+    out = ej.step(DAMPED, ej.EnergyDecaying(alpha), ej.State([q0], [v0]), args, h=h)
     mean = (out.state.q[0] - q0) / h
     jumped = 2 * mean - out.state.v[0]
     # Eq. (47e): the velocities fix the jump of the position.

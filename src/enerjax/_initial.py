@@ -100,9 +100,7 @@ def consistent_start(
     )
 
 
-def _constraint_at(
-    model: AbstractModel, t: Time
-) -> Callable[[Coordinates], Multipliers]:
+def _constraint_at(model: AbstractModel, t: Time) -> Callable[[Coordinates], Multipliers]:
     return lambda q: model.constraint(q, t)
 
 

@@ -161,9 +161,9 @@ def step(
 ) -> StepOutput:
     """Advance one state by one step of length `h`, for loops of your own.
 
-    Never raises on a failure of the step: look at `result`. All of `state`, `args`, `h`, `t`
-    and the numbers of the scheme are traced, so the function can be put in `jit`, `vmap`,
-    `lax.scan`, `grad` and `jvp`.
+    Never raises on a failure of the step: look at `result`. All of `state`, `args`, `h`,
+    `t` and the numbers of the scheme are traced, so the function can be put in `jit`,
+    `vmap`, `lax.scan`, `grad` and `jvp`.
 
     **Arguments:**
 

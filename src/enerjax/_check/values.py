@@ -92,7 +92,8 @@ def check_values(system: AbstractSystem, state: State, args: Args) -> None:
         ),
         (
             "timed",
-            f"`force` or `driven` is not finite at the start, t = {state.t}. Defined there?",
+            f"`force` or `driven` is not finite at the start, t = {state.t}. Is it defined "
+            "there?",
         ),
         ("constraint", "The constraints are not finite at the start. Defined there?"),
         (

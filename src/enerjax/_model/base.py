@@ -10,9 +10,9 @@ at `q_m = (q_a + q_b)/2`, `mu_m = (mu_a + mu_b)/2`. The drive is the discrete gr
 
     H + lambda . Phi(q) + eta . psi(q, mu),      psi = dPhi/dt
 
-Forces `f` add `-h Lm^T f` to the first row. Where constraints are driven, `Phi(q, t)`, their
-part of the drive is differenced over `q` and `t` together (`lapse.py`), and what it is in
-`t` is the power of the drive.
+Forces `f` add `-h Lm^T f` to the first row. Where constraints are driven, `Phi(q, t)`,
+their part of the discrete gradient is over `q` and `t` together (`lapse.py`), and its entry
+for `t` is the power that they bring in.
 
 Two kinds of model fill this in: `SeparableModel` for constant inertia, where `S_mu` can be
 solved for the velocities by hand, and `CanonicalModel` for any Hamiltonian.

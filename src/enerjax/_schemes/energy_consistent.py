@@ -66,7 +66,8 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
       positive part there is nothing to damp, and nothing is removed.
     - Constraints held at: position and velocity level.
     - Order: 4 at `alpha = 0` (then symmetric: `Composed` raises it to 6 or 8), else 3;
-      2 where the `derivative` is no `MeanValue()` and `V` is not quadratic.
+      2 where the `derivative` is no `MeanValue()` and `V` is not quadratic, and with
+      forces, which enter as in `EnergyPreserving`. Driven constraints keep the order.
     - Needs canonical coordinates, `v = qdot` or momenta: with `kinematics` use
       `EnergyPreserving` or `EnergyDecaying`.
 
@@ -164,7 +165,8 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
         jump_q = -h / 6 * (dv - alpha * jump_v)
         size = jump_q @ problem.stiffness @ jump_q + jump_v @ problem.inertia @ jump_v
         load, drive_work = (
-            step.load(step.start, end, z), step.drive_work(step.start, end, z)
+            step.load(step.start, end, z),
+            step.drive_work(step.start, end, z),
         )
         if drive_work is not None:
             twist = self._twist(z, problem, end.v - step.start.v)

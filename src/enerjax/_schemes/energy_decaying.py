@@ -41,10 +41,12 @@ class EnergyDecaying(AbstractSingleSolve[JumpAndEnd, StepProblem]):
       `V` is convex over the jump. (With a Hamiltonian their sum is
       `(zj - z0) . (grad H(zj) - grad H(z0)) / 2`, and `H` must be convex.) On a linear
       oscillator of frequency `w` the step tends to `rho_inf = (1 - alpha) / (1 + alpha)`
-      as `h w` grows.
+      as `h w` grows. Forces enter the intervals like `-grad V`; a linear damper never
+      feeds energy in.
     - Constraints held at: position level at `zj` and `z1`; with `formulation="ggl"`
       velocity level too.
-    - Order: 2. Unconstrained with `v = qdot`, 3 with `MeanValue()` or one coordinate.
+    - Order: 2. Unconstrained with `v = qdot`, 3 with `MeanValue()` or one coordinate, and
+      with linear dampers, but not with other forces.
       `"index3"` is the paper's: on constrained motion it tends to order 1, *locks* at
       `alpha = 0` and dissipates far too much above.
 

@@ -21,7 +21,9 @@ class EnergyPreserving(AbstractSingleSolve[Increment, StepProblem]):
 
     Solves `S(z0, z1, DH(z0, z1)) = 0` with the constraints at the end of the step.
 
-    - Conserves: energy, to round-off, at any step.
+    - Conserves: energy, to round-off, at any step. With forces and drives it changes by
+      their work: that of a force in the middle of the step, at the velocity
+      `Lm (q1 - q0)/h`, so a damper never feeds energy in.
     - Dissipates: nothing, high-frequency noise included.
     - Constraints held at: position level; with `formulation="ggl"` velocity level too.
     - Order: 2. Symmetric: `Composed` raises the order to 4, 6 or 8.

@@ -35,7 +35,7 @@ class System(AbstractSystem):
     - `force`: `force(q, v, t, args)`, the forces that no potential has, shape `(nv,)`,
       conjugate to `v`: their power is `force . v`. For a body with `v = (xdot, Omega)`
       the force in space and the torque in body axes. Dampers, motors, loads that depend
-      on the time `t`. Smooth, and of order 2 with every scheme.
+      on the time `t`. `Composed` cannot take them, and others are of order 2 with them.
     - `driven`: `driven(q, t, args)`, a vector that vanishes in every admissible
       configuration at time `t`: a pivot that is moved, a prescribed angle. Held as
       `constraint` is, and twice differentiable in `t`.
@@ -147,7 +147,13 @@ class System(AbstractSystem):
         **Returns:** what all functions take for a `System`; the `v` of a `State` is
         `qdot`, shape `(nq,)`.
         """
-        return LagrangianSystem(kinetic, potential, constraint, force, driven)
+        return LagrangianSystem(
+            kinetic=kinetic,
+            potential=potential,
+            constraint=constraint,
+            force=force,
+            driven=driven,
+        )
 
     @staticmethod
     def from_hamiltonian(
@@ -176,4 +182,6 @@ class System(AbstractSystem):
         **Returns:** what all functions take for a `System`; the `v` of a `State` is the
         momentum `p`, shape `(nq,)`. The audit counts `H(q, 0)` as potential energy.
         """
-        return HamiltonianSystem(hamiltonian, constraint, force, driven)
+        return HamiltonianSystem(
+            hamiltonian=hamiltonian, constraint=constraint, force=force, driven=driven
+        )

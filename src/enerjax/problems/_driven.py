@@ -36,10 +36,10 @@ def car_axis() -> Problem:
     right spring, which is driven at `w = 10`; the left mount is the origin. The axle
     keeps its length and the left spring stays perpendicular to the line of the mounts.
     Masses are 5e-4 (that of the mount moves nothing but the work of the drive), springs
-    of stiffness 1. Gravity acts along -y. Multipliers: of the two joints, then of the mount.
+    of stiffness 1. Gravity acts along -y.
 
-    **Source:** Test Set for IVP Solvers, release 2.4, "Car axis problem"; E. Hairer, C. Lubich
-    and M. Roche (1989).
+    **Source:** Test Set for IVP Solvers, release 2.4, car axis problem; E. Hairer,
+    C. Lubich and M. Roche (1989).
     """
     args = dict(m=5e-4, k=1.0, l=1.0, l0=0.5, g=1.0, r=0.1, w=10.0)
     system = System(_axle_kinetic, _axle_potential, _axle_joints, driven=_axle_mount)
