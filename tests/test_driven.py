@@ -1,6 +1,7 @@
 """Constraints that depend on time: order, both levels, and the work of the drive."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -136,19 +137,18 @@ def test_multipliers_stand_in_the_order_of_joints_then_drives():
 
 def test_a_top_on_a_lift_feels_what_its_inertia_feels():
     """Driven at its joint, and at rest under the force that a lift's frame adds."""
-    top, start, args = ej.problems.heavy_top()
+    system, start, args = ej.problems.heavy_top()
+    top: Any = system
     lift = lambda t: 0.05 * jnp.sin(40.0 * t)
-    up, parts = jnp.eye(6)[2], (top.kinetic, top.potential)
-    shape = dict(
-        kinematics=top.kinematics.matrix, coordinate_constraint=top.coordinate_constraint
-    )
+    up, shape = jnp.eye(6)[2], dict(kinetic=top.kinetic, potential=top.potential)
+    shape["kinematics"] = top.kinematics.matrix
+    shape["coordinate_constraint"] = top.coordinate_constraint
     moved = ej.System(
-        *parts,
         driven=lambda q, t, args: top.constraint(q, args) - lift(t) * up[:3],
         **shape,
     )
     push = lambda q, v, t, args: -args["m"] * jax.grad(jax.grad(lift))(t) * up
-    still = ej.System(*parts, top.constraint, force=push, **shape)
+    still = ej.System(constraint=top.constraint, force=push, **shape)
     rising = ej.State(start.q, start.v + 2.0 * up)
     differences = []
     for n in (25, 50):

@@ -108,7 +108,7 @@ def test_the_work_of_a_damper_in_a_decaying_step_is_a_sum_of_squares(alpha):
     # Eq. (47e): the velocities fix the jump of the position.
     lag = -(out.state.v[0] - alpha * jumped - (1 - alpha) * v0) / 6
     squares = mean**2 + 3 * lag**2
-    np.testing.assert_allclose(out.work, -args["c"] * h * squares, rtol=1e-13)
+    np.testing.assert_allclose(np.asarray(out.work), -args["c"] * h * squares, rtol=1e-13)
 
 
 def push(q, v, t, args):

@@ -97,11 +97,15 @@ def solve(
         carry = start, begin(start, h / _PARTS), ~failed
         (state, _, _), parts = jax.lax.scan(part, carry, None, length=_PARTS)
         ends, counts, results = parts
+        energies = ends.dissipated, ends.work, ends.drive_work
+        dissipated, work, drive_work = jax.tree.map(jnp.sum, energies)
         end = StepEnd(
             state,
             jnp.sum(ends.displacement, axis=0),
             jnp.mean(ends.multipliers, axis=0),
-            *jax.tree.map(jnp.sum, (ends.dissipated, ends.work, ends.drive_work)),
+            dissipated,
+            work,
+            drive_work,
             jax.tree.map(lambda x: x[-1], ends.details),
             first_of(ends.result),
         )

@@ -107,11 +107,14 @@ def advance(
     begin, inputs = (start, warm.rest), (lengths, warm.stages)
     (state, rest), (lengths, reported, memory) = jax.lax.scan(stage, begin, inputs)
     multipliers, energies, details, iterations, results = reported
+    dissipated, work, drive_work = jax.tree.map(jnp.sum, energies)
     return StepOutput(
         state,
         # The mean force over the step: stages count by their length, backwards ones too.
         lengths @ multipliers,
-        *jax.tree.map(jnp.sum, energies),
+        dissipated,
+        work,
+        drive_work,
         jax.tree.map(lambda x: x[-1], details),
         jnp.sum(iterations),
         first_of(results),

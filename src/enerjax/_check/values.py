@@ -31,11 +31,11 @@ def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]
     constraints = [system.constraint]
     if isinstance(system, System):
         constraints.append(system.coordinate_constraint)
-    timed = []
-    if system.force is not None:
-        timed.append(system.force(state.q, state.v, state.t, args))
-    if system.driven is not None:
-        timed.append(system.driven(state.q, state.t, args))
+    timed, t = [], state.t
+    if system.force is not None and t is not None:
+        timed.append(system.force(state.q, state.v, t, args))
+    if system.driven is not None and t is not None:
+        timed.append(system.driven(state.q, t, args))
     return dict(
         start=finite(state),
         args=finite([x for x in jax.tree.leaves(args) if eqx.is_inexact_array(x)]),

@@ -193,10 +193,9 @@ class AbstractModel(eqx.Module):
             out = out + h * driven.velocity_impulse @ psi
         return out
 
-    def force(self, q: Coordinates, v: Velocities, t: Time) -> Velocities | None:
-        """`f`, or `None` for a system without forces."""
-        if self.system.force is None:
-            return None
+    def force(self, q: Coordinates, v: Velocities, t: Time) -> Velocities:
+        """`f`, of a system that has forces."""
+        assert self.system.force is not None
         assert t is not None
         return self.system.force(q, v, t, self.args)
 
@@ -210,6 +209,7 @@ class AbstractModel(eqx.Module):
         size = jnp.maximum(2 * self.kinetic(state), pushed @ pushed)
         if self.system.driven is not None:
             q, t = state.q, state.t
+            assert t is not None
             moved = (self.constraint(q, t + h) - self.constraint(q, t)) / h
             size = jnp.maximum(size, jnp.sum((moved / self.scales.constraint) ** 2))
         return jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))

@@ -67,8 +67,9 @@ class CanonicalModel(AbstractModel):
 
     def slope(self, state: State) -> Coordinates:
         slope, rate = jax.grad(self.hamiltonian, argnums=(0, 1))(state.q, state.v)
-        force = self.force(state.q, rate, state.t)
-        return slope if force is None else slope - force
+        if self.system.force is None:
+            return slope
+        return slope - self.force(state.q, rate, state.t)
 
     def velocity(self, state: State) -> Velocities:
         return self.lift(state.q, state.v)
@@ -109,9 +110,14 @@ class CanonicalModel(AbstractModel):
         middle = 0.5 * (a.q + b.q), 0.5 * (a.v + b.v)
         masses = self.system.masses(*middle, self.args)
         weights = jnp.concatenate([masses, h**2 / masses])
-        ends = ((jnp.concatenate([x.q, x.v]), x.t) for x in (a, b))
-        moved = None if self.system.driven is None else moved
-        both, work = gradient_and_work(derivative, action, moved, *ends, weights)
+        both, work = gradient_and_work(
+            derivative,
+            action,
+            None if self.system.driven is None else moved,
+            (jnp.concatenate([a.q, a.v]), a.t),
+            (jnp.concatenate([b.q, b.v]), b.t),
+            weights,
+        )
         return Drive(both[:size], both[size:] / h, work)
 
     def structure(
@@ -141,9 +147,8 @@ class CanonicalModel(AbstractModel):
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
         q, p, t = state.q, state.v, state.t
         slope, rate = jax.grad(self.hamiltonian, argnums=(0, 1))(q, p)
-        force = self.force(q, rate, t)
-        if force is not None:
-            slope = slope - force
+        if self.system.force is not None:
+            slope = slope - self.force(q, rate, t)
         jacobian = jax.jacfwd(self.constraint)(q, t)
         if jacobian.shape[0] == 0:
             return -slope, jnp.zeros((0,), q.dtype)

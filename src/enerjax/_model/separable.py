@@ -88,8 +88,9 @@ class SeparableModel(AbstractModel):
 
     def slope(self, state: State) -> Coordinates:
         slope = jax.grad(self._potential)(state.q)
-        force = self.force(state.q, state.v, state.t)
-        return slope if force is None else slope - self._pull(state.q, force)
+        if self.system.force is None:
+            return slope
+        return slope - self._pull(state.q, self.force(state.q, state.v, state.t))
 
     def velocity(self, state: State) -> Velocities:
         return state.v
@@ -130,9 +131,10 @@ class SeparableModel(AbstractModel):
         def moved(q: Coordinates, t: Time) -> Scalar:
             return self.driven_action(q, self.lift(q, mean_velocity), t, h, driven)
 
-        moved = None if self.system.driven is None else moved
-        ends = ((x.q, x.t) for x in (a, b))
-        impulse, work = gradient_and_work(derivative, action, moved, *ends)
+        with_time = None if self.system.driven is None else moved
+        impulse, work = gradient_and_work(
+            derivative, action, with_time, (a.q, a.t), (b.q, b.t)
+        )
         return Drive(impulse, jnp.zeros((0,), impulse.dtype), work)
 
     def structure(

@@ -93,12 +93,13 @@ def jump_drive(
 
 
 class Loads(eqx.Module):
-    """`h L^T f` over `zj -> z1`, over `z0 -> zj`, at `z0` and at `zj`."""
+    """`h L^T f` over `zj -> z1`, over `z0 -> zj`, at `z0` and at `zj`; and their work."""
 
     after: Coordinates | None = None
     before: Coordinates | None = None
     start: Coordinates | None = None
     jump: Coordinates | None = None
+    work: Scalar | None = None
 
 
 def jump_loads(
@@ -119,21 +120,14 @@ def jump_loads(
     lag = model.push(start.q, problem.at(z.end), z.jump.rate)
     half = 0.5 * alpha.astype(v0.dtype)
     mean = problem.velocity(z.end) + 3 * lag - half * (vj - v0)
-    return Loads(
-        problem.load(jump, end, z.end),
-        problem.load(start, jump, z.end, mean),
-        problem.load(start, start, z.end, v0),
-        problem.load(jump, jump, z.end, vj),
-    )
-
-
-def jump_work(alpha: Scalar, z: JumpAndEnd, loads: Loads) -> Scalar | None:
-    """The work of the forces; its last part is that of `alpha/6 (F_j - F_0)`."""
-    if loads.after is None:
-        return None
-    half = 0.5 * alpha.astype(z.end.rate.dtype)
-    over_jump = loads.before + half * (loads.jump - loads.start)
-    return loads.after @ (z.end.rate - z.jump.rate) + over_jump @ z.jump.rate
+    after = problem.load(jump, end, z.end, problem.velocity(z.end))
+    before = problem.load(start, jump, z.end, mean)
+    at_start = problem.load(start, start, z.end, v0)
+    at_jump = problem.load(jump, jump, z.end, vj)
+    # The last part is the work of `alpha/6 (F_j - F_0)`.
+    over_jump = before + half * (at_jump - at_start)
+    work = after @ (z.end.rate - z.jump.rate) + over_jump @ z.jump.rate
+    return Loads(after, before, at_start, at_jump, work)
 
 
 def jump_energy(problem: StepProblem, jump: State) -> tuple[Scalar, Scalar]:

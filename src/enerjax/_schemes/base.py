@@ -70,18 +70,16 @@ class StepProblem(eqx.Module):
         """`Lm (q1 - q0)/h`: free of what multipliers add to velocities."""
         return self.model.push(self.start.q, self.at(end), end.rate)
 
-    def load(
-        self, a: State, b: State, end: Increment, velocity: Velocities | None = None
-    ) -> Coordinates | None:
-        """`h Lm^T f` in the middle of `a -> b`; `None` for a system without forces.
-
-        `Lm` is that of the whole step, to `end`, and so is the velocity if none is given.
-        """
+    def step_load(self, b: State, end: Increment) -> Coordinates | None:
+        """`h Lm^T f` in the middle of the step; `None` for a system without forces."""
         if self.model.system.force is None:
             return None
+        return self.load(self.start, b, end, self.velocity(end))
+
+    def load(self, a: State, b: State, end: Increment, velocity: Velocities) -> Coordinates:
+        """`h Lm^T f` in the middle of `a -> b`, with `Lm` that of the step to `end`."""
         assert a.t is not None
         assert b.t is not None
-        velocity = self.velocity(end) if velocity is None else velocity
         force = self.model.force(0.5 * (a.q + b.q), velocity, 0.5 * (a.t + b.t))
         return self.h * self.model.pull(self.start.q, self.at(end), force)
 

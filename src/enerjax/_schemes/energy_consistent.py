@@ -148,7 +148,7 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
     def residual(self, z: Increment, problem: _Frozen) -> Increment:
         step, h = problem.step, problem.step.h
         end, jump_v = self._end(z, problem)
-        drive = step.drive(step.start, end, z).less(step.load(step.start, end, z))
+        drive = step.drive(step.start, end, z).less(step.step_load(end, z))
         twist = self._twist(z, problem, end.v - step.start.v)
         dissipation = h**2 / 12 * self._alpha(h) * problem.stiffness @ jump_v
         impulse = drive.impulse - h / 12 * twist.impulse + dissipation
@@ -164,23 +164,26 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
         dv = self._velocity(problem, end.v - step.start.v)
         jump_q = -h / 6 * (dv - alpha * jump_v)
         size = jump_q @ problem.stiffness @ jump_q + jump_v @ problem.inertia @ jump_v
-        load, drive_work = (
-            step.load(step.start, end, z),
-            step.drive_work(step.start, end, z),
-        )
-        if drive_work is not None:
-            twist = self._twist(z, problem, end.v - step.start.v)
-            drive_work = drive_work - h / 12 * twist.work
+        load = step.step_load(end, z)
         return StepEnd(
             end,
             h * z.rate,
             z.impulse / h,
             0.5 * alpha * size,
             None if load is None else load @ z.rate,
-            drive_work,
+            self._drive_work(z, problem, end),
             None,
             RESULTS.successful,
         )
+
+    def _drive_work(self, z: Increment, problem: _Frozen, end: State) -> Scalar | None:
+        """The work of driven constraints, and what the twist adds to it."""
+        step = problem.step
+        if (work := step.drive_work(step.start, end, z)) is None:
+            return None
+        twist = self._twist(z, problem, end.v - step.start.v)
+        assert twist.work is not None
+        return work - step.h / 12 * twist.work
 
     def _alpha(self, h: Scalar) -> Scalar:
         return self.alpha.astype(h.dtype)
@@ -197,8 +200,7 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
         whose momentum nothing depends on.
         """
         step, model, h = problem.step, problem.step.model, problem.step.h
-        middle, t = step.start.q + 0.5 * h * z.rate, step.middle_time
-        no_lapse = jax.tree.map(jnp.zeros_like, t)
+        no_lapse = jax.tree.map(jnp.zeros_like, step.middle_time)
         if isinstance(model, SeparableModel):
             force, power = self._stiffness(z, problem, (dv, no_lapse))
             return Drive(force, dv[:0], power)
@@ -208,7 +210,8 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
             return h * model.hamiltonian(q, p) + z.impulse @ model.constraint(q, t)
 
         forces = jax.grad(action, argnums=(0, 1, 2))
-        at = middle, step.start.v + 0.5 * dv, t
+        middle = step.start.q + 0.5 * h * z.rate
+        at = middle, step.start.v + 0.5 * dv, step.middle_time
         # h D: one factor h remains in the second product, and is divided out for `w_mu`.
         _, (force, rate, _) = jax.jvp(forces, at, (h * z.rate, dv, step.lapse))
         _, (force, rate, power) = jax.jvp(forces, at, (rate / h, -force / h, no_lapse))
@@ -218,8 +221,7 @@ class EnergyConsistent(AbstractSingleSolve[Increment, _Frozen]):
         self, z: Increment, problem: _Frozen, along: tuple[Coordinates, Time]
     ) -> tuple[Coordinates, Time]:
         """`h K` at the midpoint times a vector, with its row and column of time."""
-        step = problem.step
-        model, h = step.model, step.h
+        step, model, h = problem.step, problem.step.model, problem.step.h
         assert isinstance(model, SeparableModel)
         middle = step.start.q + 0.5 * h * z.rate, step.middle_time
         action = lambda q, t: h * model.strain(q, t, z.impulse / h)

@@ -66,12 +66,12 @@ class EnergyPreserving(AbstractSingleSolve[Increment, StepProblem]):
     def residual(self, z: Increment, problem: StepProblem) -> Increment:
         end = self._end(z, problem)
         drive = problem.drive(problem.start, end, z)
-        load = problem.load(problem.start, end, z)
+        load = problem.step_load(end, z)
         return problem.rows(z, end, drive.less(load))  # eq. (14a, c)
 
     def finish(self, z: Increment, problem: StepProblem) -> StepEnd:
         end = self._end(z, problem)
-        load = problem.load(problem.start, end, z)
+        load = problem.step_load(end, z)
         return StepEnd(
             end,
             problem.h * z.rate,
