@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 import enerjax as ej
 
 from .helpers import follow, slopes
-from .shaken import ARGS, kinetic, potential, SCHEMES, SHAKEN, shaken_start
+from .shaken import ARGS, kinetic, pivot, potential, SCHEMES, SHAKEN, shaken_start
 
 
 T0, T1 = 0.2, 2.2
@@ -135,6 +135,7 @@ def test_multipliers_stand_in_the_order_of_joints_then_drives():
     np.testing.assert_allclose(start.multipliers, [3.0 * t, -floor], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_top_on_a_lift_feels_what_its_inertia_feels():
     """Driven at its joint, and at rest under the force that a lift's frame adds."""
     system, start, args = ej.problems.heavy_top()
@@ -202,3 +203,36 @@ def test_an_arm_with_a_motor_and_a_damper_in_its_joints(damping, order):
         # Solver, against an energy of 29.
         assert leak <= 1e-12
     np.testing.assert_allclose(slopes(found), order, atol=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["preserving", "decaying"])
+def test_a_large_system_is_driven_and_damped(scheme):
+    """A chain on a shaken pivot, in a medium: 40 links, solved by bands."""
+    chain, _, args = ej.problems.chain(40)
+    links: Any = chain
+    args = args | dict(r=0.1, w=4.0)
+
+    def top(q, t, args):
+        link = q[:2] - pivot(t, args)
+        return jnp.array([link @ link - args["l"][0] ** 2])
+
+    system = ej.System(
+        links.kinetic,
+        links.potential,
+        lambda q, args: links.constraint(q, args)[1:],
+        force=lambda q, v, t, args: -0.02 * v * jnp.repeat(args["m"], 2),
+        driven=top,
+    )
+    hanging = jnp.stack([jnp.zeros(40), jnp.arange(1.0, 41.0) / 40], axis=1)
+    with_pivot = jnp.tile(jnp.array([0.4, 0.0]), 40)
+    start = ej.initial_state(system, hanging.ravel(), with_pivot, args)
+    method, _ = SCHEMES[scheme]
+    run = ej.simulate(system, method, start, args, h=0.005, num_steps=60)
+    change = run.audit.work + run.audit.drive_work - run.audit.dissipated
+    # Solver, against a turnover of 10.
+    assert np.max(np.abs(np.diff(run.audit.energy) - change[1:])) <= 1e-12
+    assert np.max(np.abs(run.audit.constraint)) <= 1e-13
+    assert np.max(np.abs(run.audit.constraint_rate)) <= 1e-12
+    assert np.min(run.audit.work[1:]) < 0
+    assert np.max(np.abs(run.audit.drive_work)) > 1e-6
