@@ -40,8 +40,8 @@ class EnergyDecaying(AbstractSingleSolve[JumpAndEnd, StepProblem]):
       `V` is convex over the jump. (With a Hamiltonian their sum is
       `(zj - z0) . (grad H(zj) - grad H(z0)) / 2`, and `H` must be convex.) On a linear
       oscillator of frequency `w` the step tends to `rho_inf = (1 - alpha) / (1 + alpha)`
-      as `h w` grows. Forces enter the intervals like `-grad V`; a linear damper never
-      feeds energy in.
+      as `h w` grows. Forces enter the intervals like `-grad V`; a damper `-C v` with
+      constant `C` never feeds energy in.
     - Constraints held at: position level at `zj` and `z1`; with `formulation="ggl"`
       velocity level too.
     - Order: 2. Unconstrained with `v = qdot`, 3 with `MeanValue()` or one coordinate, and
