@@ -122,3 +122,30 @@ def slopes(errors):
     """Orders between halvings of the step."""
     errors = np.asarray(errors)
     return np.log2(errors[:-1] / errors[1:])
+
+
+def follow(system, scheme, start, args, *, h, steps, t0=0.0):
+    """A run of a traced number of steps: its end, and its balance step by step.
+
+    Returns the last state, the largest energy that no term of the balance explains, and
+    the largest work of the forces in one step.
+    """
+    numbers = jax.tree.map(jnp.asarray, (args, h, steps, t0))
+    state, leak, most, okay = _follow(system, scheme, start, *numbers)
+    return eqx.error_if(state, ~okay, "a step failed"), leak, most
+
+
+@eqx.filter_jit
+def _follow(system, scheme, start, args, h, steps, t0):
+    def body(k, carry):
+        state, leak, most, okay = carry
+        out = ej.step(system, scheme, state, args, h=h, t=t0 + k.astype(float) * h)
+        change = system.energy(out.state, args) - system.energy(state, args)
+        work = 0.0 if out.work is None else out.work
+        driven = 0.0 if out.drive_work is None else out.drive_work
+        unexplained = jnp.abs(change - work - driven + out.dissipated)
+        leak, most = jnp.maximum(leak, unexplained), jnp.maximum(most, work)
+        return out.state, leak, most, okay & (out.result == ej.RESULTS.successful)
+
+    begin = start, jnp.array(0.0), jnp.array(-jnp.inf), jnp.array(True)
+    return jax.lax.fori_loop(0, steps, body, begin)

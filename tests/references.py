@@ -181,3 +181,24 @@ FOUR_PARTICLES = {
         ),
     )
 }
+
+# Test Set for IVP Solvers, release 2.4, car axis problem at t = 3, given to 21 digits:
+# both wheels, their velocities.
+CAR_AXIS = SimpleNamespace(
+    q=np.array(
+        [
+            0.0493455784275402809,
+            0.496989460230171154,
+            1.04174252488542152,
+            0.373911027265361257,
+        ]
+    ),
+    v=np.array(
+        [
+            -0.0770583684040972358,
+            0.00744686658723778553,
+            0.0175568157537232222,
+            0.770341043779251976,
+        ]
+    ),
+)

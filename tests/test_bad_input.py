@@ -44,6 +44,7 @@ def simulate(
     h=0.01,
     num_steps=4,
     save_every=1,
+    t0=0.0,
     **system,
 ):
     return ej.simulate(
@@ -54,6 +55,7 @@ def simulate(
         h=h,
         num_steps=num_steps,
         save_every=save_every,
+        t0=t0,
     )
 
 
@@ -152,6 +154,33 @@ BAD = {
         ValueError,
         "redundant 1 times",
     ),
+    "force of the wrong shape": (
+        dict(force=lambda q, v, t, args: v[:1]),
+        ValueError,
+        "`force` returned shape \\(1,\\)",
+    ),
+    "force without time": (
+        dict(force=lambda q, v, args: v),
+        TypeError,
+        "must take 4 arguments, `\\(q, v, t, args\\)`",
+    ),
+    "force not finite": (
+        dict(force=lambda q, v, t, args: v / t),
+        ValueError,
+        "not finite at the start",
+    ),
+    "force with backward stages": (
+        dict(force=lambda q, v, t, args: -v, scheme=ej.Composed(ej.EnergyPreserving(), 4)),
+        ValueError,
+        "go backwards in time",
+    ),
+    "driven a scalar": (dict(driven=lambda q, t, args: q[0]), ValueError, "a vector"),
+    "driven without time": (
+        dict(driven=lambda q, args: q),
+        TypeError,
+        "must take 3 arguments, `\\(q, t, args\\)`",
+    ),
+    "time not finite": (dict(t0=np.inf), ValueError, "time of the start"),
     "consistent scheme with kinematics": (
         dict(kinematics=turn, scheme=ej.EnergyConsistent(0.5)),
         ValueError,

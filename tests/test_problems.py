@@ -7,7 +7,7 @@ import pytest
 import enerjax as ej
 
 from .helpers import EPS, failed, march, problem, PROBLEMS, slopes, solve, TURNOVER
-from .references import FOUR_PARTICLES, FREE_BODY, HEAVY_TOP, pendulum_reference
+from .references import CAR_AXIS, FOUR_PARTICLES, FREE_BODY, HEAVY_TOP, pendulum_reference
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
@@ -159,6 +159,29 @@ def test_four_particles_converge_to_the_published_motion(scheme, order, bound):
         assert slopes(e)[-1] == pytest.approx(order, abs=0.2)
     # Truncation: C h^p at h = 0.005.
     assert error[0][0] <= bound
+
+
+CAR_AXIS_RUNS = {
+    "preserving": (ej.EnergyPreserving(), 600, 4.2e-3, 0.6),
+    "preserving, composed": (ej.Composed(ej.EnergyPreserving(), 4), 1200, 3e-7, 2e-5),
+    "consistent": (ej.EnergyConsistent(0.0), 600, 7e-6, 5e-4),
+    "consistent, composed": (ej.Composed(ej.EnergyConsistent(0.0), 6), 300, 4e-9, 3e-7),
+}
+
+
+@pytest.mark.parametrize("case", CAR_AXIS_RUNS)
+def test_the_car_axis_meets_the_published_values(case):
+    """Driven; truncation, bounded by what was measured at these steps."""
+    scheme, steps, position, velocity = CAR_AXIS_RUNS[case]
+    system, start, args = ej.problems.car_axis()
+    run = ej.simulate(system, scheme, start, args, h=3.0 / steps, num_steps=steps)
+    assert np.max(np.abs(run.ys.q[-1, :4] - CAR_AXIS.q)) <= position
+    assert np.max(np.abs(run.ys.v[-1, :4] - CAR_AXIS.v)) <= velocity
+    # Solver, of an energy of 1.5e-3.
+    leak = np.diff(run.audit.energy) - run.audit.drive_work[1:]
+    assert np.max(np.abs(leak)) <= 1e-15
+    assert np.max(np.abs(run.audit.constraint)) <= 1e-14
+    assert np.max(np.abs(run.audit.constraint_rate)) <= 1e-13
 
 
 def test_a_chain_of_links_falls_without_losing_energy():

@@ -1,6 +1,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from ._audit import audit
 from ._check import positive_integer, prepare
@@ -34,6 +35,7 @@ def simulate(
     *,
     h: Real,
     num_steps: int,
+    t0: Real = 0.0,
     save_every: int = 1,
     root_finder: RootFinder = Newton(),
     throw: bool = True,
@@ -57,6 +59,7 @@ def simulate(
       quotient must be whole. In reverse mode the solved unknowns of each step are stored
       too, up to 10^4 steps; beyond, memory grows like the square root of the steps, at
       the cost of one more run.
+    - `t0`: the time of the start; step `k` begins at `t0 + k h`. Traced.
     - `root_finder`: for the step equations, which are scaled to order one (so tolerances
       are relative); one of optimistix can be given.
     - `throw`: raise an error at the end of a run that failed, which names the step, the
@@ -74,30 +77,37 @@ def simulate(
         raise ValueError(
             f"`num_steps` ({num_steps}) must be a multiple of `save_every` ({save_every})."
         )
-    start, args, h = prepare(system, scheme, start, args, h, root_finder)
-    solution = _run(system, scheme, start, args, h, root_finder, num_steps, save_every)
-    return _raise_failure(solution, h) if throw else solution
+    start, args, h, t0 = prepare(system, scheme, start, args, h, t0, root_finder)
+    solution = _run(system, scheme, start, args, h, t0, root_finder, num_steps, save_every)
+    return _raise_failure(solution, h, t0) if throw else solution
 
 
 @eqx.filter_jit
-def _run(system, scheme, start, args, h, root_finder, num_steps, save_every):
+def _run(system, scheme, start, args, h, t0, root_finder, num_steps, save_every):
     model = make_model(system, start, args)
     start = model.enter(start)
     acceleration, multipliers0 = model.accelerations(start)
     warm = first_warm(scheme, model, start, h, acceleration, multipliers0)
 
+    def timed(state: State, steps: Array) -> State:
+        """With the time after some steps, counted and not summed up, where time enters."""
+        return State(state.q, state.v, t0 + h * steps if system.is_timed else None)
+
     def one_step(carry: _Carry, live: Flag):
         skip = (carry.result != RESULTS.successful) | ~live
-        out = advance(scheme, model, carry.state, h, carry.warm, root_finder, skip)
+        begin = timed(carry.state, carry.completed.astype(h.dtype))
+        out = advance(scheme, model, begin, h, carry.warm, root_finder, skip)
         result = first_failure(carry.result, out.result)
         result = RESULTS.where(live, result, carry.result)
         good = live & (result == RESULTS.successful)
-        state, memory = _select(good, (out.state, out.warm), (carry.state, carry.warm))
+        reached = State(out.state.q, out.state.v)
+        state, memory = _select(good, (reached, out.warm), (carry.state, carry.warm))
         completed = carry.completed + good.astype(carry.completed.dtype)
         reported = (out.multipliers, out.details)
+        energies = (out.dissipated, out.work, out.drive_work)
         return _Carry(state, memory, result, completed), (
             reported,
-            jnp.where(good, out.dissipated, 0),
+            jax.tree.map(lambda x: jnp.where(good, x, 0), energies),
             jnp.where(skip, 0, out.newton_iterations),
         )
 
@@ -105,30 +115,31 @@ def _run(system, scheme, start, args, h, root_finder, num_steps, save_every):
     scan_of_rows, scan_of_steps = scans(num_saves, save_every)
 
     def one_save(carry: _Carry, live: Flag):
-        carry, (reported, dissipated, iterations) = scan_of_steps(
+        carry, (reported, energies, iterations) = scan_of_steps(
             keep_roots(one_step), carry, jnp.full((save_every,), live)
         )
         last = jax.tree.map(lambda x: x[-1], reported)
-        row = (carry.state, *last, jnp.sum(dissipated))
+        row = (carry.state, *last, jax.tree.map(jnp.sum, energies))
         good = carry.result == RESULTS.successful
         return carry, (_nan_unless(good, row), iterations)
 
-    begin = _Carry(start, warm, _check_start(scheme, model, start, h), jnp.array(0))
+    result0 = _check_start(scheme, model, start, h)
+    begin = _Carry(State(start.q, start.v), warm, result0, jnp.array(0))
     end, (rows, iterations) = scan_of_rows(one_save, begin, jnp.ones((num_saves,), bool))
-    states, multipliers, details, dissipated = rows
-    row0 = (start, multipliers0, jnp.zeros_like(h))
-    states, multipliers, dissipated = jax.tree.map(
+    states, multipliers, details, energies = rows
+    row0 = (begin.state, multipliers0, jax.tree.map(lambda _: jnp.zeros_like(h), energies))
+    states, multipliers, energies = jax.tree.map(
         lambda first, rest: jnp.concatenate([first[None], rest]),
         row0,
-        (states, multipliers, dissipated),
+        (states, multipliers, energies),
     )
-    times = h * jnp.arange(0, num_steps + 1, save_every, dtype=h.dtype)
+    saved = jnp.arange(0, num_steps + 1, save_every, dtype=h.dtype)
     return Solution(
-        times,
+        t0 + h * saved,
         jax.vmap(model.leave)(states),
         multipliers,
         details,
-        audit(model, states, dissipated),
+        audit(model, timed(states, saved), *energies),
         Statistics(iterations.reshape(-1), end.completed),
         end.result,
     )
@@ -155,26 +166,27 @@ def _check_start(
     root = jnp.sqrt(model.energy_scale(start, h))
     # NaN compares false: a start that cannot be measured fails at its first step.
     tolerance = jnp.sqrt(jnp.finfo(h.dtype).eps)
-    position = jnp.abs(model.constraint(start.q))
+    position = jnp.abs(model.constraint(start.q, start.t))
     rounding = 1e3 * jnp.finfo(h.dtype).eps * scales.constraint_size
     far = position > 1e2 * tolerance * h * root * scales.constraint + rounding
     bad = jnp.any(far)
     if scheme.stage.formulation == "ggl":
-        rate = jnp.abs(model.joint_rate(start.q, start.v))
+        rate = jnp.abs(model.joint_rate(start.q, start.v, start.t))
         fast = rate > 1e2 * tolerance * root * scales.constraint[: rate.size]
         bad = bad | jnp.any(fast)
     return RESULTS.where(bad, RESULTS.inconsistent_start, RESULTS.successful)
 
 
-def _raise_failure(solution: Solution, h: Scalar) -> Solution:
+def _raise_failure(solution: Solution, h: Scalar, t0: Scalar) -> Solution:
     failed = solution.result != RESULTS.successful
-    if not is_known((failed, solution.stats.completed_steps, h)):
+    if not is_known((failed, solution.stats.completed_steps, h, t0)):
         return solution.result.error_if(solution, failed)
     if failed:
         done = int(solution.stats.completed_steps)
+        begin, end = (float(t0) + k * float(h) for k in (done, done + 1))
         raise eqx.EquinoxRuntimeError(
-            f"The run failed in step {done + 1}, from t = {done * float(h):.6g} to "
-            f"{(done + 1) * float(h):.6g}. {RESULTS[solution.result]} "
+            f"The run failed in step {done + 1}, from t = {begin:.6g} to {end:.6g}. "
+            f"{RESULTS[solution.result]} "
             "(`throw=False` returns the run up to there.)"
         )
     return solution

@@ -23,11 +23,11 @@ class Statistics(eqx.Module):
 class Solution(eqx.Module):
     """A run. Every array has a leading axis of saved times; row 0 is the start.
 
-    - `ts`: shape `(times,)`, counted from 0 (time).
+    - `ts`: shape `(times,)`, from `t0` on (time).
     - `ys`: a `State` with `q` of shape `(times, nq)` and `v` of shape `(times, nv)`.
-    - `multipliers`: shape `(times, nc)`, `lambda` of the step that ends at each row,
-      joints first; row 0 those of the consistent start. The force on the coordinates is
-      `-B^T lambda`.
+    - `multipliers`: shape `(times, nc)`, `lambda` of the step that ends at each row:
+      joints, driven constraints, relations between coordinates, in this order; row 0 those
+      of the consistent start. The force on the coordinates is `-B^T lambda`.
     - `details`: what the scheme reports of its own, for the steps that end at the rows
       after the start (`KappaDecaying`: kappa, shape `(times - 1,)`), or `None`.
     - `audit`: energies and constraint residuals.

@@ -97,11 +97,15 @@ def solve(
         carry = start, begin(start, h / _PARTS), ~failed
         (state, _, _), parts = jax.lax.scan(part, carry, None, length=_PARTS)
         ends, counts, results = parts
+        energies = ends.dissipated, ends.work, ends.drive_work
+        dissipated, work, drive_work = jax.tree.map(jnp.sum, energies)
         end = StepEnd(
             state,
             jnp.sum(ends.displacement, axis=0),
             jnp.mean(ends.multipliers, axis=0),
-            jnp.sum(ends.dissipated),
+            dissipated,
+            work,
+            drive_work,
             jax.tree.map(lambda x: x[-1], ends.details),
             first_of(ends.result),
         )
@@ -171,6 +175,6 @@ def _free_flight(
     scheme: AbstractSingleSolve, problem: Any, model: AbstractModel, start: State
 ) -> PyTree[Any]:
     """The unknowns of a step in which no force acts."""
-    num_constraints = jax.eval_shape(model.constraint, start.q).shape[0]
+    num_constraints = jax.eval_shape(model.constraint, start.q, start.t).shape[0]
     no_force = jnp.zeros((num_constraints,), start.q.dtype)
     return scheme.predict(problem, jnp.zeros_like(start.v), no_force)

@@ -40,8 +40,11 @@ class StepOutput(eqx.Module):
     """One step, done or failed.
 
     - `state`: at the end of the step; meaningless if the step failed.
-    - `multipliers`: `lambda` of the step, `(nc,)`, joints first.
+    - `multipliers`: `lambda` of the step, `(nc,)`, of joints, driven constraints and
+      relations between coordinates, in this order.
     - `dissipated`: energy that the scheme removed, by its own identity.
+    - `work`, `drive_work`: energy that `force` and `driven` constraints brought in; `None`
+      for a system that has none.
     - `details`: what the scheme reports of its own, or `None`.
     - `newton_iterations`: over all solves of the step.
     - `result`: a `RESULTS`; compare it with `RESULTS.successful`.
@@ -51,6 +54,8 @@ class StepOutput(eqx.Module):
     state: State
     multipliers: Multipliers
     dissipated: Scalar
+    work: Scalar | None
+    drive_work: Scalar | None
     details: PyTree[Any]
     newton_iterations: Count
     result: RESULTS
@@ -93,19 +98,23 @@ def advance(
         end, iterations, result, memory = solve(
             scheme.stage, model, state, length * h, memory, root_finder, skip
         )
-        reported = (end.multipliers, end.dissipated, end.details, iterations, result)
+        energies = (end.dissipated, end.work, end.drive_work)
+        reported = (end.multipliers, energies, end.details, iterations, result)
         q, rest = _sum_and_rest(state.q, end.displacement + rest)
-        return (State(q, end.state.v), rest), (length, reported, memory)
+        return (State(q, end.state.v, end.state.t), rest), (length, reported, memory)
 
     lengths = jnp.asarray(scheme.stages, h.dtype)
     begin, inputs = (start, warm.rest), (lengths, warm.stages)
     (state, rest), (lengths, reported, memory) = jax.lax.scan(stage, begin, inputs)
-    multipliers, dissipated, details, iterations, results = reported
+    multipliers, energies, details, iterations, results = reported
+    dissipated, work, drive_work = jax.tree.map(jnp.sum, energies)
     return StepOutput(
         state,
         # The mean force over the step: stages count by their length, backwards ones too.
         lengths @ multipliers,
-        jnp.sum(dissipated),
+        dissipated,
+        work,
+        drive_work,
         jax.tree.map(lambda x: x[-1], details),
         jnp.sum(iterations),
         first_of(results),
@@ -149,20 +158,22 @@ def step(
     args: Args = None,
     *,
     h: Real,
+    t: Real = 0.0,
     warm: Warm | None = None,
     root_finder: RootFinder = Newton(),
 ) -> StepOutput:
     """Advance one state by one step of length `h`, for loops of your own.
 
-    Never raises on a failure of the step: look at `result`. All of `state`, `args`, `h`
-    and the numbers of the scheme are traced, so the function can be put in `jit`, `vmap`,
-    `lax.scan`, `grad` and `jvp`.
+    Never raises on a failure of the step: look at `result`. All of `state`, `args`, `h`,
+    `t` and the numbers of the scheme are traced, so the function can be put in `jit`,
+    `vmap`, `lax.scan`, `grad` and `jvp`.
 
     **Arguments:**
 
     - `system`, `scheme`, `state`, `args`: as for `simulate`. The state must satisfy the
       constraints; see `initial_state`.
     - `h`: length of the step (time), positive.
+    - `t`: the time at which the step starts, for `force` and `driven`.
     - `warm`: `warm` of the step before, if it had the same `h`. Without it the
       accelerations and multipliers at `state` are computed to predict the step.
     - `root_finder`: an optimistix root finder; see `simulate`.
@@ -171,5 +182,5 @@ def step(
 
     **Raises:** `ValueError` or `TypeError` for wrong shapes, types and signs.
     """
-    state, args, h = prepare(system, scheme, state, args, h, root_finder)
+    state, args, h, _ = prepare(system, scheme, state, args, h, t, root_finder)
     return _single_step(system, scheme, state, args, h, warm, root_finder)

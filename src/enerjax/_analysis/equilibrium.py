@@ -11,7 +11,7 @@ from .._newton import Newton
 from .._root import find_root, RootFinder
 from .._system import AbstractSystem, HamiltonianSystem, State
 from .._tracing import is_known
-from .._types import Args, Coordinates, Flag, Multipliers, Scalar
+from .._types import Args, Coordinates, Flag, Multipliers, Real, Scalar
 
 
 # Newton may wander before it converges, on long chains for one.
@@ -35,9 +35,10 @@ def equilibrium(
     guess: State,
     args: Args = None,
     *,
+    t: Real = 0.0,
     root_finder: RootFinder = Newton(),
 ) -> Equilibrium:
-    """A pose where `dV/dq + B^T lambda = 0` and `Phi = 0`, from a guess near it.
+    """A pose where `dV/dq + B^T lambda = L^T f` and `Phi = 0`, from a guess near it.
 
     Differentiable with respect to `args` by the implicit function theorem. What is found
     can be unstable, as a pendulum on its head: `modes` tells.
@@ -47,6 +48,7 @@ def equilibrium(
     - `system`, `args`: as for `simulate`.
     - `guess`: its coordinates need not satisfy the constraints, its velocities do not
       matter. Far from an equilibrium let a damped run come close to one.
+    - `t`: the time at which forces and drives are taken to stand still.
     - `root_finder`: for equations that are scaled to order one; see `simulate`.
 
     **Returns:** an `Equilibrium`.
@@ -55,7 +57,7 @@ def equilibrium(
     `equinox.EquinoxRuntimeError`; `ValueError` and `TypeError` for bad input, and for a
     `System.from_hamiltonian`, which can be in balance while its momenta do not vanish.
     """
-    rest, args = at_rest(system, guess, args)
+    rest, args = at_rest(system, guess, args, t)
     found, residual, ok = _solve(system, rest, args, root_finder)
     message = (
         "No equilibrium was found from this guess. There may be none (a free body under "
@@ -69,7 +71,9 @@ def equilibrium(
     return found
 
 
-def at_rest(system: AbstractSystem, state: State, args: Args) -> tuple[State, Args]:
+def at_rest(
+    system: AbstractSystem, state: State, args: Args, t: Real
+) -> tuple[State, Args]:
     """Checked input of an analysis of a system that rests."""
     if isinstance(system, HamiltonianSystem):
         raise ValueError(
@@ -77,8 +81,8 @@ def at_rest(system: AbstractSystem, state: State, args: Args) -> tuple[State, Ar
             "need not have vanishing momenta. Describe it by `System` or "
             "`System.from_lagrangian`."
         )
-    state, args = check_system(system, state, args)
-    return State(state.q, jnp.zeros_like(state.v)), args
+    state, args = check_system(system, state, args, t)
+    return State(state.q, jnp.zeros_like(state.v), state.t), args
 
 
 @eqx.filter_jit
@@ -94,17 +98,17 @@ def _solve(
         model, unit, size = inputs
         shift, tension = x
         q = q0 + unit * shift
-        constraint, pull = jax.vjp(model.constraint, q)
-        push = jax.grad(lambda q: model.potential(State(q, guess.v)))(q)
-        force = push + pull(size * tension / scales.constraint)[0]
+        constraint, pull = jax.vjp(lambda q: model.constraint(q, guess.t), q)
+        slope = model.slope(State(q, guess.v, guess.t))
+        force = slope + pull(size * tension / scales.constraint)[0]
         rows = size * scales.constraint + scales.constraint_size
         return force / (size * scales.coordinate), constraint / rows
 
     # The multipliers that come closest to balance: there are more rows than these.
-    pull = jax.jacfwd(model.constraint)(q0) / scales.coordinate[None]
+    pull = jax.jacfwd(model.constraint)(q0, guess.t) / scales.coordinate[None]
     pull = pull / scales.constraint[:, None]
-    push = jax.grad(lambda q: model.potential(State(q, guess.v)))(q0) / scales.coordinate
-    tension = jnp.linalg.lstsq(pull.T, -push)[0] / size
+    slope = model.slope(guess) / scales.coordinate
+    tension = jnp.linalg.lstsq(pull.T, -slope)[0] / size
     zero = (jnp.zeros_like(q0), tension)
     inputs = (model, unit, size)
     root = find_root(balance, root_finder, zero, inputs, max_iterations=_MAX_ITERATIONS)
@@ -117,7 +121,6 @@ def _solve(
 
 def _size(model: AbstractModel, guess: State) -> Scalar:
     """The force that is to be balanced, in the root of an energy; no derivative."""
-    force = jax.grad(lambda q: model.potential(State(q, guess.v)))(guess.q)
     length = largest(guess.q * model.scales.coordinate)
-    size = jnp.maximum(largest(force / model.scales.coordinate), length)
+    size = jnp.maximum(largest(model.slope(guess) / model.scales.coordinate), length)
     return jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))

@@ -12,7 +12,7 @@ from .._check import check_system
 from .._linear import as_dense
 from .._model import AbstractModel, make_model
 from .._system import AbstractSystem, State
-from .._types import Args
+from .._types import Args, Real
 
 
 # Relative size below which a singular value counts as zero.
@@ -50,6 +50,7 @@ def mobility(
     state: State,
     args: Args = None,
     *,
+    t: Real = 0.0,
     names: Sequence[str] | None = None,
 ) -> Mobility:
     """Counts the freedoms of a mechanism, and finds the constraints that repeat others.
@@ -62,13 +63,14 @@ def mobility(
 
     - `system`, `state`, `args`: as for `simulate`. The constraints need not hold. Numbers,
       not traced values.
+    - `t`: the time, for `driven` constraints.
     - `names`: of the rows of the constraints, joints first; their numbers by default.
 
     **Returns:** a `Mobility`.
 
     **Raises:** `ValueError` for bad input, and for a wrong number of names.
     """
-    state, args = check_system(system, state, args)
+    state, args = check_system(system, state, args, t)
     model = make_model(system, state, args)
     scaled, root, residual = _scaled_constraints(model, state)
     num_constraints, num_coordinates = scaled.shape
@@ -86,7 +88,7 @@ def mobility(
     left, values, right = np.linalg.svd(scaled)
     rank = int(np.sum(values > _RANK))
     # Rows that span the others come first in a factorisation with pivoting.
-    _, _, order = scipy.linalg.qr(scaled.T, pivoting=True)
+    *_, order = scipy.linalg.qr(scaled.T, pivoting=True)
     # What no motion can repair: the part of the residual outside of the range.
     stuck = left[:, rank:] @ (left[:, rank:].T @ residual)
     return Mobility(
@@ -107,10 +109,12 @@ def _scaled_constraints(
     the residual in parts of the sizes of the constraints."""
     inner = model.enter(state)
     root = np.linalg.cholesky(np.asarray(as_dense(model.metric(inner))))
-    jacobian = np.asarray(jax.jacfwd(model.constraint)(state.q))
+    jacobian = np.asarray(jax.jacfwd(model.constraint)(state.q, state.t))
     scaled = scipy.linalg.solve_triangular(root, jacobian.T, lower=True).T
     lengths = np.linalg.norm(scaled, axis=1)
     unit = np.where(lengths > 0, lengths, 1.0)
     size = np.asarray(model.scales.constraint_size)
-    residual = np.asarray(model.constraint(state.q)) / np.where(size > 0, size, 1.0)
+    residual = np.asarray(model.constraint(state.q, state.t)) / np.where(
+        size > 0, size, 1.0
+    )
     return scaled / unit[:, None], root, residual

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from .._linear import as_dense, cholesky, eigh, inverse
 from .._model import make_model
 from .._system import AbstractSystem, State
-from .._types import Args
+from .._types import Args, Real
 from .equilibrium import at_rest
 
 
@@ -31,7 +31,9 @@ class Modes(eqx.Module):
         return jnp.where(self.eigenvalues < 0, -root, root)
 
 
-def modes(system: AbstractSystem, state: State, args: Args = None) -> Modes:
+def modes(
+    system: AbstractSystem, state: State, args: Args = None, *, t: Real = 0.0
+) -> Modes:
     """The modes of vibration about an equilibrium, with all constraints held.
 
     The eigenvalues of `Hess(V + lambda . Phi)` against the inertia, on the motions that
@@ -42,13 +44,20 @@ def modes(system: AbstractSystem, state: State, args: Args = None) -> Modes:
 
     - `system`, `args`: as for `simulate`.
     - `state`: an equilibrium; its velocities are taken to be zero.
+    - `t`: the time at which `driven` constraints are taken to stand still.
 
     **Returns:** `Modes`, as many as there are coordinates less constraints, which must be
     independent.
 
-    **Raises:** `ValueError` and `TypeError` for bad input.
+    **Raises:** `ValueError` and `TypeError` for bad input, and for a system with a `force`,
+    whose modes need not be vibrations.
     """
-    rest, args = at_rest(system, state, args)
+    if system.force is not None:
+        raise ValueError(
+            "`modes` are free vibrations without damping, and this system has a `force`. "
+            "Leave it out, or give its potential."
+        )
+    rest, args = at_rest(system, state, args, t)
     return _modes(system, rest, args)
 
 
@@ -57,10 +66,11 @@ def _modes(system: AbstractSystem, rest: State, args: Args) -> Modes:
     model = make_model(system, rest, args)
     q = rest.q
     _, multipliers = model.accelerations(model.enter(rest))
-    strain = lambda q: model.potential(State(q, rest.v)) + multipliers @ model.constraint(q)
+    held = lambda q: model.constraint(q, rest.t)
+    strain = lambda q: model.potential(State(q, rest.v)) + multipliers @ held(q)
     back = inverse(cholesky(as_dense(model.metric(model.enter(rest)))))
     stiffness = back @ jax.hessian(strain)(q) @ back.T
-    rows = jax.jacfwd(model.constraint)(q) @ back.T
+    rows = jax.jacfwd(held)(q) @ back.T
     num_constraints = rows.shape[0]
     admitted = jnp.eye(q.size, dtype=q.dtype)
     if num_constraints > 0:

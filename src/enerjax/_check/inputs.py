@@ -18,7 +18,7 @@ from .._schemes import AbstractScheme
 from .._system import AbstractSystem, State
 from .._tracing import is_known
 from .._types import Args, Real, Scalar
-from .shapes import check_shapes
+from .shapes import check_shapes, describe
 from .values import check_values
 
 
@@ -28,9 +28,10 @@ def prepare(
     start: State,
     args: Args,
     h: Real,
+    t: Real,
     root_finder: RootFinder,
-) -> tuple[State, Args, Scalar]:
-    """Checked start, `args` of arrays, and `h` in the dtype of the start."""
+) -> tuple[State, Args, Scalar, Scalar]:
+    """Checked start, `args` of arrays, and `h` and `t` in the dtype of the start."""
     if not isinstance(root_finder, RootFinder):
         raise TypeError(
             "`root_finder` must be a root finder such as `enerjax.Newton()` or one of "
@@ -41,7 +42,14 @@ def prepare(
             f"`scheme` must be a scheme such as `EnergyPreserving()`, got {scheme!r}"
             + (": the parentheses are missing." if isinstance(scheme, type) else ".")
         )
-    start, args = check_system(system, start, args)
+    start, args = check_system(system, start, args, t)
+    if system.force is not None and min(scheme.stages) < 0:
+        raise ValueError(
+            f"`{type(scheme).__name__}` has stages that go backwards in time, and there a "
+            f"damper feeds energy in: {describe('force', system.force)} cannot be used "
+            "with it. Take the scheme that is composed, with a shorter `h`; constraints "
+            "that are `driven` may stay."
+        )
     if any(jnp.ndim(x) > 0 for x in jax.tree.leaves(scheme)):
         raise ValueError(
             f"The numbers of the scheme must be scalars, got {scheme}. To sweep them put "
@@ -54,7 +62,7 @@ def prepare(
         raise ValueError(
             f"`h` must be a scalar, got shape {h.shape}. To sweep it use `jax.vmap`."
         )
-    return start, args, h
+    return start, args, h, jnp.asarray(t, h.dtype)
 
 
 def positive_integer(name: str, count: Any) -> int:
@@ -68,8 +76,10 @@ def positive_integer(name: str, count: Any) -> int:
     return number
 
 
-def check_system(system: AbstractSystem, state: State, args: Args) -> tuple[State, Args]:
-    """Checks a system against a state and `args`, and makes arrays of their leaves."""
+def check_system(
+    system: AbstractSystem, state: State, args: Args, t: Real
+) -> tuple[State, Args]:
+    """Checks a system against a state, `args` and the time, and makes arrays of them."""
     if not isinstance(system, AbstractSystem):
         raise TypeError(f"`system` must be an `enerjax.System`, got {type(system)}.")
     if not isinstance(state, State):
@@ -90,6 +100,9 @@ def check_system(system: AbstractSystem, state: State, args: Args) -> tuple[Stat
     if q.dtype == jnp.float32 and not jax.config.read("jax_enable_x64"):
         _warn_single_precision()
     args = jax.tree.map(lambda x: _as_array(x, q.dtype), args)
+    if jnp.ndim(t) != 0 or (is_known(t) and not np.isfinite(t)):
+        raise ValueError(f"The time of the start must be a finite number, got {t}.")
+    state = State(q, v, jnp.asarray(t, q.dtype) if system.is_timed else None)
     check_shapes(system, state, args)
     if is_known((system, state, args)):
         check_values(system, state, args)

@@ -24,6 +24,8 @@ _SIGNATURES = dict(
     hamiltonian="`(q, p, args)`",
     constraint="`(q, args)`",
     coordinate_constraint="`(q, args)`",
+    force="`(q, v, t, args)`",
+    driven="`(q, t, args)`",
     kinematics="`(q, args)`",
 )
 
@@ -62,7 +64,9 @@ def check_shapes(system: AbstractSystem, state: State, args: Args) -> None:
                 f"{describe(role, fn)} must return a scalar, an energy, got shape {shape}."
                 + (" Sum over the bodies, or index the entry." if shape else "")
             )
-    _rows("constraint", system.constraint, state, args)
+    _rows("constraint", system.constraint, state.q, args)
+    _rows("driven", system.driven, state.q, state.t, args)
+    _check_force(system, state, args)
     if isinstance(system, System):
         _check_separable(system, state, args)
     elif state.q.size != state.v.size:
@@ -90,11 +94,23 @@ def energies(
     return [potential, ("kinetic", system.kinetic, (v, args))]
 
 
-def _rows(role: str, fn: Callable | None, state: State, args: Args) -> int:
+def _check_force(system: AbstractSystem, state: State, args: Args) -> None:
+    if system.force is None:
+        return
+    shape = _shape("force", system.force, state.q, state.v, state.t, args)
+    if shape != state.v.shape:
+        raise ValueError(
+            f"{describe('force', system.force)} returned shape {shape}, but `v` has "
+            f"{state.v.size} entries: give one for each, conjugate to it (its power is "
+            "`force . v`). A force on a point enters with the Jacobian of the point."
+        )
+
+
+def _rows(role: str, fn: Callable | None, *inputs: Any) -> int:
     """The number of rows of a constraint."""
     if fn is None:
         return 0
-    shape = _shape(role, fn, state.q, args)
+    shape = _shape(role, fn, *inputs)
     if len(shape) != 1:
         raise ValueError(
             f"{describe(role, fn)} must return a vector, got shape {shape}. "
@@ -110,7 +126,7 @@ def _check_separable(system: System, state: State, args: Args) -> None:
             f"The inertia matrix has shape {system.kinetic.shape}, but `v` has {nv} "
             f"entries: give a ({nv}, {nv}) matrix."
         )
-    redundant = _rows("coordinate_constraint", system.coordinate_constraint, state, args)
+    redundant = _rows("coordinate_constraint", system.coordinate_constraint, state.q, args)
     if not isinstance(system.kinematics, ConfigurationKinematics):
         if nq != nv:
             raise ValueError(

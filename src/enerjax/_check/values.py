@@ -31,10 +31,16 @@ def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]
     constraints = [system.constraint]
     if isinstance(system, System):
         constraints.append(system.coordinate_constraint)
+    timed, t = [], state.t
+    if system.force is not None and t is not None:
+        timed.append(system.force(state.q, state.v, t, args))
+    if system.driven is not None and t is not None:
+        timed.append(system.driven(state.q, t, args))
     return dict(
         start=finite(state),
         args=finite([x for x in jax.tree.leaves(args) if eqx.is_inexact_array(x)]),
         potential=finite(system.potential_energy(state, args)),
+        timed=finite(timed),
         constraint=finite([f(state.q, args) for f in constraints if f is not None]),
         inertia=finite(inertia),
         quadratic=_is_quadratic(system, state, inertia, args),
@@ -83,6 +89,11 @@ def check_values(system: AbstractSystem, state: State, args: Args) -> None:
         (
             "potential",
             f"{potential} is not finite at the start, q = {state.q}. Is it defined there?",
+        ),
+        (
+            "timed",
+            f"`force` or `driven` is not finite at the start, t = {state.t}. Is it defined "
+            "there?",
         ),
         ("constraint", "The constraints are not finite at the start. Defined there?"),
         (

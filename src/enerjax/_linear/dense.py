@@ -89,10 +89,6 @@ class AbstractFactors(eqx.Module):
     def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
         """Nearly `matrix^-1 right`; not finite where the matrix is singular."""
 
-    def solve_transposed(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
-        """`matrix^-T right`, for derivatives in reverse mode."""
-        return jax.linear_transpose(self.solve, right)(right)[0]
-
 
 class Inverse(AbstractFactors):
     """An approximate inverse, which a chord iteration makes good.

@@ -70,7 +70,7 @@ class Linearisable(eqx.Module):
             lambda t: jax.jvp(self.value, (x,), (t,))[1],
             right,
             lambda _, right: factors.solve(right),
-            lambda _, right: factors.solve_transposed(right),
+            lambda _, right: jax.linear_transpose(factors.solve, right)(right)[0],
         )
 
 

@@ -1,11 +1,8 @@
 from .._system import AbstractCanonicalSystem, AbstractSystem, State, System
 from .._types import Args
-from .base import (
-    AbstractModel as AbstractModel,
-    Drive as Drive,
-    Increment as Increment,
-)
+from .base import AbstractModel as AbstractModel
 from .canonical import CanonicalModel as CanonicalModel
+from .interval import Drive as Drive, Increment as Increment, Time as Time
 from .separable import SeparableModel as SeparableModel
 
 

@@ -10,6 +10,10 @@ at `q_m = (q_a + q_b)/2`, `mu_m = (mu_a + mu_b)/2`. The drive is the discrete gr
 
     H + lambda . Phi(q) + eta . psi(q, mu),      psi = dPhi/dt
 
+Forces `f` add `-h Lm^T f` to the first row. Where constraints are driven, `Phi(q, t)`,
+their part of the discrete gradient is over `q` and `t` together (`lapse.py`), and its entry
+for `t` is the power that they bring in.
+
 Two kinds of model fill this in: `SeparableModel` for constant inertia, where `S_mu` can be
 solved for the velocities by hand, and `CanonicalModel` for any Hamiltonian.
 """
@@ -32,49 +36,7 @@ from .._types import (
     Scalar,
     Velocities,
 )
-
-
-class Increment(eqx.Module):
-    """The unknowns that lead to one node of a step, and the rows that determine them.
-
-    | field | as unknown | as row |
-    |---|---|---|
-    | `rate` | `(q - q0)/h` | balance of momentum, `S_q` |
-    | `momentum` | `p`; empty where velocities are eliminated | `S_mu/h` |
-    | `impulse` | `h lambda` | `Phi(q)/h` |
-    | `velocity_impulse` | `eta` | `psi(q, v)`; empty for index 3 |
-
-    The rate and not `q` is the unknown: the rounding of `q`, divided by `h`, would
-    otherwise enter the velocities. Each unknown and its row have reciprocal units, so
-    one set of `Scales` serves both.
-    """
-
-    rate: Coordinates
-    momentum: Float[Array, " np"]
-    impulse: Multipliers
-    velocity_impulse: JointMultipliers
-
-
-class Drive(eqx.Module):
-    """What drives an interval: `h w_q`, and `w_mu` where momenta are unknowns."""
-
-    impulse: Coordinates
-    drift: Float[Array, " np"]
-
-
-class Scales(eqx.Module):
-    """How large a unit of each unknown is in the square root of an energy.
-
-    `coordinate`: of a rate of change of each coordinate (square root of a mass).
-    `constraint`: of the rate of change of each constraint, in the same measure; so
-    `rate * coordinate`, `constraint rate / constraint` and
-    `impulse * constraint` all have the dimension of the square root of an energy.
-    """
-
-    coordinate: Float[Array, " nq"]
-    constraint: Float[Array, " nc"]
-    # What the constraints are differences of: their round-off, divided by eps.
-    constraint_size: Float[Array, " nc"]
+from .interval import Drive, Increment, lapse_of, Scales, Time
 
 
 class AbstractModel(eqx.Module):
@@ -103,7 +65,7 @@ class AbstractModel(eqx.Module):
 
     @abc.abstractmethod
     def leave(self, state: State) -> State:
-        """A state of the schemes as the user has it."""
+        """A state of the schemes as the user has it, without its time."""
 
     @abc.abstractmethod
     def kinetic(self, state: State) -> Scalar: ...
@@ -131,6 +93,22 @@ class AbstractModel(eqx.Module):
         self, a: State, b: State, h: Scalar, rate: Coordinates, drive: Drive
     ) -> Drive:
         """`S_q` and `S_mu/h`; `rate` is `(q_b - q_a)/h`, exact."""
+
+    @abc.abstractmethod
+    def slope(self, state: State) -> Coordinates:
+        """`dH/dq` less the applied forces `L^T f`."""
+
+    @abc.abstractmethod
+    def velocity(self, state: State) -> Velocities:
+        """The velocities that forces are conjugate to: `L qdot` or `dH/dp`."""
+
+    @abc.abstractmethod
+    def push(self, qa: Coordinates, qb: Coordinates, rate: Coordinates) -> Velocities:
+        """`Lm rate`"""
+
+    @abc.abstractmethod
+    def pull(self, qa: Coordinates, qb: Coordinates, force: Velocities) -> Coordinates:
+        """`Lm^T force`"""
 
     @abc.abstractmethod
     def reaction(self, state: State, eta: JointMultipliers) -> Velocities:
@@ -165,36 +143,87 @@ class AbstractModel(eqx.Module):
     def multipliers(self, state: State) -> Multipliers:
         """`lambda` alone, of `accelerations`."""
 
-    def joint(self, q: Coordinates) -> JointMultipliers:
-        """The constraints that are held at velocity level too."""
+    def fixed(self, q: Coordinates) -> Float[Array, " nf"]:
+        """The joints that do not depend on time."""
         if self.system.constraint is None:
             return jnp.zeros((0,), q.dtype)
         return self.system.constraint(q, self.args)
 
-    @abc.abstractmethod
-    def constraint(self, q: Coordinates) -> Multipliers:
-        """`Phi(q)`: joints first, then coordinate constraints."""
+    def driven(self, q: Coordinates, t: Time) -> Float[Array, " nd"]:
+        """The joints that do."""
+        if self.system.driven is None:
+            return jnp.zeros((0,), q.dtype)
+        assert t is not None
+        return self.system.driven(q, t, self.args)
 
-    def joint_rate(self, q: Coordinates, v: Velocities) -> JointMultipliers:
-        """`psi(q, v) = dPhi/dt` of the joints."""
-        return jax.jvp(self.joint, (q,), (self.lift(q, v),))[1]
+    def joint(self, q: Coordinates, t: Time) -> JointMultipliers:
+        """The constraints that are held at velocity level too: fixed, then driven."""
+        if self.system.driven is None:
+            return self.fixed(q)
+        return jnp.concatenate([self.fixed(q), self.driven(q, t)])
+
+    @abc.abstractmethod
+    def constraint(self, q: Coordinates, t: Time) -> Multipliers:
+        """`Phi(q, t)`: joints first, then coordinate constraints."""
+
+    def joint_rate(self, q: Coordinates, v: Velocities, t: Time) -> JointMultipliers:
+        """`psi(q, v, t) = dPhi/dt` of the joints."""
+        return jax.jvp(self.joint, (q, t), (self.lift(q, v), lapse_of(t)))[1]
+
+    def split(self, increment: Increment) -> tuple[Increment, Increment]:
+        """The multipliers of what does not depend on time, and those of what does."""
+        if self.system.driven is None:
+            return increment, increment
+        q, t = increment.rate, jnp.zeros((), increment.rate.dtype)
+        first = jax.eval_shape(self.fixed, q).size
+        last = first + jax.eval_shape(self.driven, q, t).size
+
+        def parts(x: Array) -> tuple[Array, Array]:
+            return jnp.concatenate([x[:first], x[last:]]), x[first:last]
+
+        impulses, etas = parts(increment.impulse), parts(increment.velocity_impulse)
+        rate, momentum = increment.rate, increment.momentum
+        fixed, driven = zip(impulses, etas, strict=True)
+        return Increment(rate, momentum, *fixed), Increment(rate, momentum, *driven)
+
+    def driven_action(
+        self, q: Coordinates, rate: Coordinates, t: Time, h: Scalar, driven: Increment
+    ) -> Scalar:
+        """`h (lambda . g + eta . dg/dt)` of the driven joints."""
+        constraint, psi = jax.jvp(self.driven, (q, t), (rate, lapse_of(t)))
+        out = driven.impulse @ constraint
+        if driven.velocity_impulse.size > 0:
+            out = out + h * driven.velocity_impulse @ psi
+        return out
+
+    def force(self, q: Coordinates, v: Velocities, t: Time) -> Velocities:
+        """`f`, of a system that has forces."""
+        assert self.system.force is not None
+        assert t is not None
+        return self.system.force(q, v, t, self.args)
 
     def energy_scale(self, state: State, h: Scalar) -> Scalar:
         """An energy that a step of length `h` handles; never zero, no derivative.
 
-        The larger of the kinetic energy and of what the potential forces, acting for `h`
-        on a body at rest, would make of it.
+        The largest of the kinetic energy and of what the forces, acting for `h`, and the
+        drives would make of that of a body at rest.
         """
-        pushed = self.gradient(state, h).impulse / self.scales.coordinate
+        pushed = h * self.slope(state) / self.scales.coordinate
         size = jnp.maximum(2 * self.kinetic(state), pushed @ pushed)
+        if self.system.driven is not None:
+            q, t = state.q, state.t
+            assert t is not None
+            moved = (self.constraint(q, t + h) - self.constraint(q, t)) / h
+            size = jnp.maximum(size, jnp.sum((moved / self.scales.constraint) ** 2))
         return jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
 
     def _scales(self, state: State) -> Scales:
         """The scales at `q`. They steer Newton's tests and never enter a solution."""
         q = state.q
         coordinate = jnp.sqrt(self.metric(state).diagonal())
-        pattern = RowPattern(self.constraint, q)
-        entries, columns = pattern.derivative(self.constraint, q), pattern.columns
+        constraint = lambda q: self.constraint(q, state.t)
+        pattern = RowPattern(constraint, q)
+        entries, columns = pattern.derivative(constraint, q), pattern.columns
         constraint = jnp.sqrt(jnp.sum((entries / coordinate[columns]) ** 2, axis=1))
         # A gradient that vanishes makes the step equations singular, which is reported
         # as such; it must not turn the scaling into a division by zero.

@@ -15,7 +15,9 @@ from .._types import (
     Scalar,
     Velocities,
 )
-from .base import AbstractModel, Drive, Increment, Scales
+from .base import AbstractModel
+from .interval import Drive, Increment, lapse_of, Scales, Time
+from .lapse import gradient_and_work
 
 
 class CanonicalModel(AbstractModel):
@@ -39,7 +41,7 @@ class CanonicalModel(AbstractModel):
         return True
 
     def enter(self, state: State) -> State:
-        return State(state.q, self.system.momentum(state, self.args))
+        return State(state.q, self.system.momentum(state, self.args), state.t)
 
     def leave(self, state: State) -> State:
         return State(state.q, self.system.velocity(state.q, state.v, self.args))
@@ -53,8 +55,8 @@ class CanonicalModel(AbstractModel):
     def potential(self, state: State) -> Scalar:
         return self.system.potential_energy(state, self.args)
 
-    def constraint(self, q: Coordinates) -> Multipliers:
-        return self.joint(q)
+    def constraint(self, q: Coordinates, t: Time) -> Multipliers:
+        return self.joint(q, t)
 
     def lift(self, q: Coordinates, v: Velocities) -> Coordinates:
         return self.system.hamiltonian_and_rate(q, v, self.args)[1]
@@ -62,6 +64,21 @@ class CanonicalModel(AbstractModel):
     def gradient(self, state: State, h: Scalar) -> Drive:
         force, rate = jax.grad(self.hamiltonian, argnums=(0, 1))(state.q, state.v)
         return Drive(h * force, rate)
+
+    def slope(self, state: State) -> Coordinates:
+        slope, rate = jax.grad(self.hamiltonian, argnums=(0, 1))(state.q, state.v)
+        if self.system.force is None:
+            return slope
+        return slope - self.force(state.q, rate, state.t)
+
+    def velocity(self, state: State) -> Velocities:
+        return self.lift(state.q, state.v)
+
+    def push(self, qa: Coordinates, qb: Coordinates, rate: Coordinates) -> Velocities:
+        return rate
+
+    def pull(self, qa: Coordinates, qb: Coordinates, force: Velocities) -> Coordinates:
+        return force
 
     def drive(
         self,
@@ -72,29 +89,36 @@ class CanonicalModel(AbstractModel):
         increment: Increment,
     ) -> Drive:
         size = a.q.size
+        fixed, driven = self.split(increment)
 
         def action(z: Float[Array, " nz"]) -> Scalar:
             q, p = z[:size], z[size:]
             energy, rate = self.system.hamiltonian_and_rate(q, p, self.args)
             out = h * energy
-            if increment.velocity_impulse.size > 0:
-                constraint, psi = jax.jvp(self.joint, (q,), (rate,))
-                return (
-                    out
-                    + increment.impulse @ constraint
-                    + h * increment.velocity_impulse @ psi
-                )
-            if increment.impulse.size > 0:
-                out = out + increment.impulse @ self.constraint(q)
+            if fixed.velocity_impulse.size > 0:
+                constraint, psi = jax.jvp(self.fixed, (q,), (rate,))
+                return out + fixed.impulse @ constraint + h * fixed.velocity_impulse @ psi
+            if fixed.impulse.size > 0:
+                out = out + fixed.impulse @ self.fixed(q)
             return out
+
+        def moved(z: Float[Array, " nz"], t: Time) -> Scalar:
+            q = z[:size]
+            return self.driven_action(q, self.lift(q, z[size:]), t, h, driven)
 
         # Lengths of positions and momenta have no common measure but by a time.
         middle = 0.5 * (a.q + b.q), 0.5 * (a.v + b.v)
         masses = self.system.masses(*middle, self.args)
         weights = jnp.concatenate([masses, h**2 / masses])
-        ends = (jnp.concatenate([x.q, x.v]) for x in (a, b))
-        both = derivative.gradient(action, *ends, weights=weights)
-        return Drive(both[:size], both[size:] / h)
+        both, work = gradient_and_work(
+            derivative,
+            action,
+            None if self.system.driven is None else moved,
+            (jnp.concatenate([a.q, a.v]), a.t),
+            (jnp.concatenate([b.q, b.v]), b.t),
+            weights,
+        )
+        return Drive(both[:size], both[size:] / h, work)
 
     def structure(
         self, a: State, b: State, h: Scalar, rate: Coordinates, drive: Drive
@@ -102,7 +126,7 @@ class CanonicalModel(AbstractModel):
         return Drive(b.v - a.v + drive.impulse, rate - drive.drift)
 
     def reaction(self, state: State, eta: JointMultipliers) -> Velocities:
-        _, transpose = jax.vjp(lambda p: self.joint_rate(state.q, p), state.v)
+        _, transpose = jax.vjp(lambda p: self.joint_rate(state.q, p, state.t), state.v)
         return transpose(eta)[0]
 
     def metric(self, state: State) -> Float[Array, "nq nq"]:
@@ -115,22 +139,25 @@ class CanonicalModel(AbstractModel):
         self, state: State, multipliers: Multipliers
     ) -> tuple[Float[Array, "nq nq"], Float[Array, "nq nq"]]:
         def energy(q: Coordinates) -> Scalar:
-            return self.hamiltonian(q, state.v) + multipliers @ self.constraint(q)
+            constraint = self.constraint(q, state.t)
+            return self.hamiltonian(q, state.v) + multipliers @ constraint
 
         return jax.hessian(energy)(state.q), self.metric(state)
 
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
-        q, p = state.q, state.v
-        force, rate = jax.grad(self.hamiltonian, argnums=(0, 1))(q, p)
-        jacobian = jax.jacfwd(self.constraint)(q)
+        q, p, t = state.q, state.v, state.t
+        slope, rate = jax.grad(self.hamiltonian, argnums=(0, 1))(q, p)
+        if self.system.force is not None:
+            slope = slope - self.force(q, rate, t)
+        jacobian = jax.jacfwd(self.constraint)(q, t)
         if jacobian.shape[0] == 0:
-            return -force, jnp.zeros((0,), q.dtype)
-        rates = jax.jacfwd(self.joint_rate, argnums=1)(q, p)
-        _, change = jax.jvp(self.joint_rate, (q, p), (rate, -force))
+            return -slope, jnp.zeros((0,), q.dtype)
+        rates = jax.jacfwd(self.joint_rate, argnums=1)(q, p, t)
+        _, change = jax.jvp(self.joint_rate, (q, p, t), (rate, -slope, lapse_of(t)))
         unit = 1 / self.scales.constraint
         matrix = unit[:, None] * (rates @ jacobian.T) * unit[None, :]
         multipliers = unit * jnp.linalg.solve(matrix, unit * change)
-        return -force - multipliers @ jacobian, multipliers
+        return -slope - multipliers @ jacobian, multipliers
 
     def multipliers(self, state: State) -> Multipliers:
         return self.accelerations(state)[1]

@@ -1,6 +1,6 @@
 """Large systems as sums over elements: rods, springs, any row of the constraints."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import TypeAlias
 
 import jax
@@ -10,7 +10,9 @@ from jaxtyping import Array, Float
 from .._discrete import AbstractCorrected
 from .._linear import jacobian_pattern, LARGE, RowPattern
 from .._system import Elements, System
-from .._types import Args, Coordinates
+from .._types import Args, Coordinates, Scalar
+from .interval import Time
+from .lapse import over_time
 
 
 # A function whose entries are added up, each of a few coordinates.
@@ -33,20 +35,26 @@ def element_energies(system: System, q: Coordinates, args: Args) -> list[Summand
     return [lambda q, part=part: part.each(q, args) for part in potential.parts]
 
 
-def discrete_gradient_by_rows(
+def gradient_and_work_by_rows(
     derivative: AbstractCorrected,
-    fns: Iterable[Summands],
-    a: Coordinates,
-    b: Coordinates,
-) -> Coordinates:
-    """The discrete gradient of a sum, each summand corrected by itself.
+    still: list[Summands],
+    moved: Callable[[Coordinates, Time], Scalar] | None,
+    a: tuple[Coordinates, Time],
+    b: tuple[Coordinates, Time],
+) -> tuple[Coordinates, Scalar | None]:
+    """As `gradient_and_work`, each summand of `still` corrected by itself.
 
     A correction along the whole increment would couple all bodies with each other.
     """
-    total = jnp.zeros_like(a)
-    for fn in fns:
-        rows = RowPattern(fn, a)
+    (qa, ta), (qb, tb) = a, b
+    total, work = jnp.zeros_like(qa), None
+    if moved is not None and ta is not tb:
+        total, work = over_time(derivative, moved, a, b)
+    elif moved is not None:
+        still = [*still, lambda q: moved(q, ta)[None]]
+    for fn in still:
+        rows = RowPattern(fn, qa)
         gradients = lambda q, fn=fn, rows=rows: rows.derivative(fn, q)
-        by_row = derivative.gradients_of_rows(fn, gradients, rows.own, a, b)
+        by_row = derivative.gradients_of_rows(fn, gradients, rows.own, qa, qb)
         total = total.at[rows.columns].add(by_row)
-    return total
+    return total, work

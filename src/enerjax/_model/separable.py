@@ -6,6 +6,7 @@ positions and momenta,
 
     psi_b - psi_a = [D_q (C v_m)] (q_b - q_a) + 1/2 (C_a + C_b) (v_b - v_a),
 
+(with `D_q` over positions and time where constraints are driven, and `psi` affine in `v`)
 which leaves `S_mu` free of the velocities at its end but for their mean: schemes solve it
 for them.
 """
@@ -18,12 +19,10 @@ from jaxtyping import Array, Float
 from .._discrete import AbstractCorrected, AbstractDerivative
 from .._kinematics import IdentityKinematics
 from .._linear import (
-    affine_root,
     as_dense,
     Assembled,
     inverse_of,
     row_hessians,
-    solve,
     Symmetric,
 )
 from .._system import State, System
@@ -35,13 +34,16 @@ from .._types import (
     Scalar,
     Velocities,
 )
-from .base import AbstractModel, Drive, Increment, Scales
+from .balance import accelerations, multipliers
+from .base import AbstractModel
 from .elements import (
-    discrete_gradient_by_rows,
     element_energies,
+    gradient_and_work_by_rows,
     is_weight,
     Summands,
 )
+from .interval import Drive, Increment, Scales, Time
+from .lapse import gradient_and_work
 
 
 class SeparableModel(AbstractModel):
@@ -75,7 +77,7 @@ class SeparableModel(AbstractModel):
         return state
 
     def leave(self, state: State) -> State:
-        return state
+        return State(state.q, state.v)
 
     def kinetic(self, state: State) -> Scalar:
         return self.kinetic_of(state.v)
@@ -98,12 +100,23 @@ class SeparableModel(AbstractModel):
             return jnp.zeros((0,), q.dtype)
         return self.system.coordinate_constraint(q, self.args)
 
-    def constraint(self, q: Coordinates) -> Multipliers:
-        return jnp.concatenate([self.joint(q), self.coordinate(q)])
+    def constraint(self, q: Coordinates, t: Time) -> Multipliers:
+        return jnp.concatenate([self.joint(q, t), self.coordinate(q)])
+
+    def slope(self, state: State) -> Coordinates:
+        slope = jax.grad(self._potential)(state.q)
+        if self.system.force is None:
+            return slope
+        return slope - self._pull(state.q, self.force(state.q, state.v, state.t))
+
+    def velocity(self, state: State) -> Velocities:
+        return state.v
 
     def push(self, qa: Coordinates, qb: Coordinates, rate: Coordinates) -> Velocities:
-        """`Lm rate`"""
         return self.system.kinematics.push(0.5 * (qa + qb), rate, self.args)
+
+    def pull(self, qa: Coordinates, qb: Coordinates, force: Velocities) -> Coordinates:
+        return self._pull(0.5 * (qa + qb), force)
 
     def _pull(self, q: Coordinates, momentum: Velocities) -> Coordinates:
         return self.system.kinematics.pull(q, momentum, self.args)
@@ -120,29 +133,36 @@ class SeparableModel(AbstractModel):
         increment: Increment,
     ) -> Drive:
         mean_velocity = 0.5 * (a.v + b.v)
+        fixed, driven = self.split(increment)
+
+        held = lambda q: jnp.concatenate([self.fixed(q), self.coordinate(q)])
+        rate = lambda q: jax.jvp(self.fixed, (q,), (self.lift(q, mean_velocity),))[1]
 
         def action(q: Coordinates) -> Scalar:
             out = h * self._potential(q)
-            if increment.impulse.size > 0:
-                out = out + increment.impulse @ self.constraint(q)
-            if increment.velocity_impulse.size > 0:
-                rate = self.joint_rate(q, mean_velocity)
-                out = out + h * increment.velocity_impulse @ rate
+            if fixed.impulse.size > 0:
+                out = out + fixed.impulse @ held(q)
+            if fixed.velocity_impulse.size > 0:
+                out = out + h * fixed.velocity_impulse @ rate(q)
             return out
 
-        none = jnp.zeros((0,), h.dtype)
+        def moved(q: Coordinates, t: Time) -> Scalar:
+            return self.driven_action(q, self.lift(q, mean_velocity), t, h, driven)
+
+        with_time = None if self.system.driven is None else moved
+        ends, none = ((a.q, a.t), (b.q, b.t)), jnp.zeros((0,), h.dtype)
         energies = self._element_energies(a.q)
         if energies is None or not isinstance(derivative, AbstractCorrected):
-            return Drive(derivative.gradient(action, a.q, b.q), none)
+            impulse, work = gradient_and_work(derivative, action, with_time, *ends)
+            return Drive(impulse, none, work)
         rows: list[Summands] = [lambda q, fn=fn: h * fn(q) for fn in energies]
-        rows += [lambda q: increment.impulse * self.constraint(q)]
-        if increment.velocity_impulse.size > 0:
-            eta = h * increment.velocity_impulse
-            rows += [lambda q: eta * self.joint_rate(q, mean_velocity)]
-        impulse = discrete_gradient_by_rows(derivative, rows, a.q, b.q)
+        rows += [lambda q: fixed.impulse * held(q)]
+        if fixed.velocity_impulse.size > 0:
+            rows += [lambda q: h * fixed.velocity_impulse * rate(q)]
+        impulse, work = gradient_and_work_by_rows(derivative, rows, with_time, *ends)
         if self.is_weight:
             impulse = impulse + h * jax.grad(self._potential)(a.q)
-        return Drive(impulse, none)
+        return Drive(impulse, none, work)
 
     def structure(
         self, a: State, b: State, h: Scalar, rate: Coordinates, drive: Drive
@@ -158,21 +178,25 @@ class SeparableModel(AbstractModel):
         return Drive(change + drive.impulse, drive.drift)
 
     def reaction(self, state: State, eta: JointMultipliers) -> Velocities:
-        return self.reaction_at(state.q, eta)
+        return self.reaction_at(state.q, state.t, eta)
 
-    def reaction_at(self, q: Coordinates, eta: JointMultipliers) -> Velocities:
-        """`M^-1 C(q)^T eta`; as `psi` is linear in `v`, the same for every `v`."""
+    def reaction_at(self, q: Coordinates, t: Time, eta: JointMultipliers) -> Velocities:
+        """`M^-1 C(q, t)^T eta`; as `psi` is affine in `v`, the same for every `v`."""
         rest = jnp.zeros((self.inertia.shape[0],), q.dtype)
         if eta.size == 0:
             return rest
-        _, transpose = jax.vjp(lambda v: self.joint_rate(q, v), rest)
+        _, transpose = jax.vjp(lambda v: self.joint_change(q, v, t), rest)
         return self.inverse_inertia @ transpose(eta)[0]
 
     def mean_reaction(
-        self, qa: Coordinates, qb: Coordinates, eta: JointMultipliers
+        self, qa: Coordinates, ta: Time, qb: Coordinates, tb: Time, eta: JointMultipliers
     ) -> Velocities:
         """`D_mu (eta . psi) = 1/2 M^-1 (C_a + C_b)^T eta`"""
-        return 0.5 * (self.reaction_at(qa, eta) + self.reaction_at(qb, eta))
+        return 0.5 * (self.reaction_at(qa, ta, eta) + self.reaction_at(qb, tb, eta))
+
+    def joint_change(self, q: Coordinates, v: Velocities, t: Time) -> JointMultipliers:
+        """`C(q, t) v`, the part of `psi` that is linear in `v`."""
+        return jax.jvp(lambda q: self.joint(q, t), (q,), (self.lift(q, v),))[1]
 
     def metric(self, state: State) -> Symmetric:
         """The inertia in the coordinates, made regular where they are redundant.
@@ -198,9 +222,9 @@ class SeparableModel(AbstractModel):
     ) -> tuple[Float[Array, "nq nq"] | Assembled, Symmetric]:
         energies = self._element_energies(state.q)
         if energies is None:
-            strain = jax.hessian(lambda q: self.strain(q, multipliers))
+            strain = jax.hessian(lambda q: self.strain(q, state.t, multipliers))
             return strain(state.q), as_dense(self.inertia)
-        of_constraints = lambda q: multipliers * self.constraint(q)
+        of_constraints = lambda q: multipliers * self.constraint(q, state.t)
         fns = [*energies, of_constraints]
         return Assembled(tuple(row_hessians(fn, state.q) for fn in fns)), self.inertia
 
@@ -208,46 +232,12 @@ class SeparableModel(AbstractModel):
         """All of the potential of a large system that bends, if its elements are known."""
         return [] if self.is_weight else element_energies(self.system, q, self.args)
 
-    def strain(self, q: Coordinates, multipliers: Multipliers) -> Scalar:
+    def strain(self, q: Coordinates, t: Time, multipliers: Multipliers) -> Scalar:
         """`V + lambda . Phi`, the energy whose Hessian is the stiffness."""
-        return self._potential(q) + multipliers @ self.constraint(q)
+        return self._potential(q) + multipliers @ self.constraint(q, t)
 
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
-        """The constraints enter twice differentiated; coordinate constraints have no
-        acceleration level of their own (their multipliers close the `nq` rows).
-        """
-        q, v, scales = state.q, state.v, self.scales
-        qdot = self.lift(q, v)
-        force = jax.grad(self._potential)(q)
-        gyroscopic = self.system.kinematics.gyroscopic(q, self.inertia @ v, qdot, self.args)
-        if gyroscopic is not None:
-            force = force + gyroscopic
-        _, drift = jax.jvp(lambda x: self.joint_rate(x, v), (q,), (qdot,))
-        _, transpose = jax.vjp(self.constraint, q)
-        unit = 1 / jnp.sqrt(self.inertia.diagonal())
-
-        def conditions(x: Array) -> Array:
-            acceleration, multipliers = unit * x[: v.size], x[v.size :] / scales.constraint
-            pulled = self._pull(q, self.inertia @ acceleration) + transpose(multipliers)[0]
-            rate = self.joint_rate(q, acceleration) + drift
-            rows = (
-                (pulled + force) / scales.coordinate,
-                rate / scales.constraint[: rate.size],
-            )
-            return jnp.concatenate(rows)
-
-        x = affine_root(conditions, jnp.zeros((v.size + scales.constraint.size,), q.dtype))
-        return unit * x[: v.size], x[v.size :] / scales.constraint
+        return accelerations(self, state)
 
     def multipliers(self, state: State) -> Multipliers:
-        """By the constraints alone where `L = I`: a smaller matrix."""
-        inverse_inertia = self.inverse_inertia
-        if not self.has_canonical_rates or not isinstance(inverse_inertia, Array):
-            return self.accelerations(state)[1]
-        q, v = state.q, state.v
-        rows = jax.jacfwd(self.constraint)(q) / self.scales.constraint[:, None]
-        _, drift = jax.jvp(lambda x: self.joint_rate(x, v), (q,), (v,))
-        push = inverse_inertia @ jax.grad(self._potential)(q)
-        right = drift / self.scales.constraint - rows @ push
-        mobility = rows @ inverse_inertia @ rows.T
-        return solve(mobility, right) / self.scales.constraint
+        return multipliers(self, state)

@@ -3,11 +3,12 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from .._model import Drive, Increment, SeparableModel
 from .._system import State
 from .._tracing import is_known
-from .._types import Multipliers, Real, Scalar, Velocities
+from .._types import Coordinates, Multipliers, Real, Scalar, Velocities
 from .base import StepProblem
 
 
@@ -81,13 +82,52 @@ def jump_drive(
 
     eq. (47b); `start` and `jump` are the gradients there.
     """
-    return jax.tree.map(
-        lambda g, h, x0, xj: -(g - h) / 3 + alpha.astype(g.dtype) / 6 * (xj - x0),
-        after,
-        before,
-        start,
-        jump,
+
+    def combined(g: Array, h: Array, x0: Array, xj: Array) -> Array:
+        return -(g - h) / 3 + alpha.astype(g.dtype) / 6 * (xj - x0)
+
+    drives = after, before, start, jump
+    return Drive(
+        combined(*(x.impulse for x in drives)), combined(*(x.drift for x in drives))
     )
+
+
+class Loads(eqx.Module):
+    """`h L^T f` over `zj -> z1`, over `z0 -> zj`, at `z0` and at `zj`; and their work."""
+
+    after: Coordinates | None = None
+    before: Coordinates | None = None
+    start: Coordinates | None = None
+    jump: Coordinates | None = None
+    work: Scalar | None = None
+
+
+def jump_loads(
+    alpha: Scalar, z: JumpAndEnd, problem: StepProblem, jump: State, end: State
+) -> Loads:
+    """The forces of a discontinuous step; none for a system without.
+
+    They enter like `-grad V`, at velocities that come from the positions. That over the
+    jump, without constraints `(v0 + vj)/2`, is written so that the work of a damper is a
+    sum of squares for any step and any constraints: with `F = -c v`
+
+        W = -c h (|(q1 - q0)/h|^2 + 3 |(qj - q0)/h|^2)
+    """
+    model, start = problem.model, problem.start
+    if model.system.force is None:
+        return Loads()
+    v0, vj = model.velocity(start), model.velocity(jump)
+    lag = model.push(start.q, problem.at(z.end), z.jump.rate)
+    half = 0.5 * alpha.astype(v0.dtype)
+    mean = problem.velocity(z.end) + 3 * lag - half * (vj - v0)
+    after = problem.load(jump, end, z.end, problem.velocity(z.end))
+    before = problem.load(start, jump, z.end, mean)
+    at_start = problem.load(start, start, z.end, v0)
+    at_jump = problem.load(jump, jump, z.end, vj)
+    # The last part is the work of `alpha/6 (F_j - F_0)`.
+    over_jump = before + half * (at_jump - at_start)
+    work = after @ (z.end.rate - z.jump.rate) + over_jump @ z.jump.rate
+    return Loads(after, before, at_start, at_jump, work)
 
 
 def jump_energy(problem: StepProblem, jump: State) -> tuple[Scalar, Scalar]:

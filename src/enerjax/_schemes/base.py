@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from .._discrete import AbstractDerivative
-from .._model import AbstractModel, Drive, Increment
+from .._model import AbstractModel, Drive, Increment, Time
 from .._results import RESULTS
 from .._system import State
 from .._types import (
@@ -35,23 +35,59 @@ class StepProblem(eqx.Module):
     derivative: AbstractDerivative
     formulation: Formulation = eqx.field(static=True)
 
+    @property
+    def lapse(self) -> Time:
+        """The time that passes, where time enters."""
+        return None if self.start.t is None else self.h
+
+    @property
+    def end_time(self) -> Time:
+        return None if self.start.t is None else self.start.t + self.h
+
+    @property
+    def middle_time(self) -> Time:
+        return None if self.start.t is None else self.start.t + 0.5 * self.h
+
     def at(self, increment: Increment) -> Coordinates:
         """The configuration that an increment leads to."""
         return self.start.q + self.h * increment.rate
 
-    def node(self, increment: Increment) -> State:
+    def node(self, increment: Increment, t: Time) -> State:
         """The state that an increment leads to, where momenta are unknowns."""
-        return State(self.at(increment), increment.momentum)
+        return State(self.at(increment), increment.momentum, t)
 
     def drive(self, a: State, b: State, increment: Increment) -> Drive:
         """The discrete gradient over `a -> b`."""
         return self.model.drive(self.derivative, a, b, self.h, increment)
 
-    def joint_rate(self, q: Coordinates, v: Velocities) -> JointMultipliers:
+    def drive_work(self, a: State, b: State, increment: Increment) -> Scalar | None:
+        """The work of the driven constraints over `a -> b`; `None` without any."""
+        if self.model.system.driven is None:
+            return None
+        return self.drive(a, b, increment).work
+
+    def velocity(self, end: Increment) -> Velocities:
+        """`Lm (q1 - q0)/h`: free of what multipliers add to velocities."""
+        return self.model.push(self.start.q, self.at(end), end.rate)
+
+    def step_load(self, b: State, end: Increment) -> Coordinates | None:
+        """`h Lm^T f` in the middle of the step; `None` for a system without forces."""
+        if self.model.system.force is None:
+            return None
+        return self.load(self.start, b, end, self.velocity(end))
+
+    def load(self, a: State, b: State, end: Increment, velocity: Velocities) -> Coordinates:
+        """`h Lm^T f` in the middle of `a -> b`, with `Lm` that of the step to `end`."""
+        assert a.t is not None
+        assert b.t is not None
+        force = self.model.force(0.5 * (a.q + b.q), velocity, 0.5 * (a.t + b.t))
+        return self.h * self.model.pull(self.start.q, self.at(end), force)
+
+    def joint_rate(self, state: State) -> JointMultipliers:
         """`psi(q, v)` where the formulation holds it, else no rows."""
         if self.formulation == "index3":
-            return jnp.zeros((0,), q.dtype)
-        return self.model.joint_rate(q, v)
+            return jnp.zeros((0,), state.q.dtype)
+        return self.model.joint_rate(state.q, state.v, state.t)
 
     def rows(self, z: Increment, node: State, drive: Drive) -> Increment:
         """The rows of one node: the structure residual, and the constraints held there."""
@@ -59,15 +95,15 @@ class StepProblem(eqx.Module):
         return Increment(
             structure.impulse,
             structure.drift,
-            self.model.constraint(node.q) / self.h,
-            self.joint_rate(node.q, node.v),
+            self.model.constraint(node.q, node.t) / self.h,
+            self.joint_rate(node),
         )
 
     def guess(self, acceleration: Velocities, multipliers: Multipliers) -> Increment:
         """The increment of a Taylor step of the whole length."""
         q, v, h = self.start.q, self.start.v, self.h
         momentum = v + h * acceleration
-        num_rates = jax.eval_shape(self.joint_rate, q, v).size
+        num_rates = jax.eval_shape(self.joint_rate, self.start).size
         return Increment(
             self.model.lift(q, v + 0.5 * h * acceleration),
             momentum if self.model.has_own_momenta else momentum[:0],
@@ -83,6 +119,8 @@ class StepEnd(eqx.Module):
     - `displacement`: of the configuration over the step, not yet rounded to that of `q`.
     - `multipliers`: `lambda` of the step, joints first (energy per constraint unit).
     - `dissipated`: the energy that the scheme removed, by its own identity.
+    - `work`, `drive_work`: of the forces and of the driven constraints; `None` for a
+      system that has none.
     - `details`: what the scheme reports of its own, or `None`.
     - `result`: a failure that the scheme itself can see.
     """
@@ -91,6 +129,8 @@ class StepEnd(eqx.Module):
     displacement: Coordinates
     multipliers: Multipliers
     dissipated: Scalar
+    work: Scalar | None
+    drive_work: Scalar | None
     details: PyTree[Any]
     result: RESULTS
 

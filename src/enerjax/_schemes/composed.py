@@ -16,6 +16,8 @@ class Composed(AbstractScheme):
       `Gonzalez()` spoils orders 6 and 8.
     - Cost: one solve a stage. From order 2: 5, 9 and 17 stages for orders 4, 6 and 8; from
       order 4 (`EnergyConsistent(0.0)`): 5 and 9 for orders 6 and 8.
+    - Takes driven constraints, but no `force`: a damper would feed energy in where a stage
+      goes backwards. Such a system raises a `ValueError`.
 
     **Arguments:**
 

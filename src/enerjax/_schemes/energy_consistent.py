@@ -4,17 +4,23 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from .._discrete import AbstractDerivative, MeanValue
-from .._linear import as_dense, Assembled, inverse, Symmetric
-from .._model import AbstractModel, CanonicalModel, Drive, Increment, SeparableModel
+from .._linear import Assembled
+from .._model import (
+    AbstractModel,
+    CanonicalModel,
+    Drive,
+    Increment,
+    SeparableModel,
+    Time,
+)
 from .._results import RESULTS
 from .._system import State
 from .._tracing import is_known
 from .._types import Coordinates, Multipliers, Real, Scalar, Velocities
 from ._decaying import alpha_from_spectral_radius, as_alpha, JumpAndEnd
-from ._semidefinite import semidefinite_part
+from ._frozen import freeze, Frozen
 from .base import (
     AbstractSingleSolve,
     check_derivative,
@@ -24,27 +30,11 @@ from .base import (
 )
 
 
-class _Frozen(eqx.Module):
-    """A step's data, with the dissipative stiffness fixed before the solve."""
-
-    step: StepProblem
-    # P = diag(K+, M^-1): the positive semidefinite part of the stiffness near the start,
-    # and the inertia there.
-    stiffness: Float[Array, "nq nq"] | Assembled
-    inertia: Symmetric
-    compliance: Float[Array, "nq nq"]
-    # X = (M + lag^2 K+)^-1 (h/6) K+ with lag = alpha h/6: j_v = X (dq + lag dv). Empty
-    # where the stiffness is assembled: X would be full, so j_v is an unknown there.
-    jump: Float[Array, "nq nq"]
-    # (1 + lag X)^-1, where velocities are eliminated.
-    damping: Float[Array, "nq nq"]
-
-
 # The end of the step, and where it is an unknown the jump, a velocity.
 _Unknowns: TypeAlias = Increment | JumpAndEnd
 
 
-class EnergyConsistent(AbstractSingleSolve[_Unknowns, _Frozen]):
+class EnergyConsistent(AbstractSingleSolve[_Unknowns, Frozen]):
     r"""One interval, order 4 or 3, and decay for any potential.
 
     The jump `j` of the discontinuous schemes in closed form, so that the unknowns are
@@ -69,7 +59,8 @@ class EnergyConsistent(AbstractSingleSolve[_Unknowns, _Frozen]):
       matrix is decomposed, at a cost that grows with its cube.)
     - Constraints held at: position and velocity level.
     - Order: 4 at `alpha = 0` (then symmetric: `Composed` raises it to 6 or 8), else 3;
-      2 where the `derivative` is no `MeanValue()` and `V` is not quadratic.
+      2 where the `derivative` is no `MeanValue()` and `V` is not quadratic, and with
+      forces, which enter as in `EnergyPreserving`. Driven constraints keep the order.
     - Needs canonical coordinates, `v = qdot` or momenta: with `kinematics` use
       `EnergyPreserving` or `EnergyDecaying`.
 
@@ -115,7 +106,7 @@ class EnergyConsistent(AbstractSingleSolve[_Unknowns, _Frozen]):
     def order(self) -> int:
         return 4 if self.symmetric else 3
 
-    def problem(self, model: AbstractModel, start: State, h: Scalar) -> _Frozen:
+    def problem(self, model: AbstractModel, start: State, h: Scalar) -> Frozen:
         if not model.has_canonical_rates:
             raise ValueError(
                 "`EnergyConsistent` needs velocities that are the rates of the "
@@ -124,28 +115,10 @@ class EnergyConsistent(AbstractSingleSolve[_Unknowns, _Frozen]):
                 "(directors, or `System.from_hamiltonian`)."
             )
         step = StepProblem(model, start, h, self.derivative, "ggl")
-        # P only has to be semidefinite and near the stiffness for the law and the order,
-        # so the multipliers of the start serve. Inside the solve it would cost an
-        # eigenvalue problem per iteration.
-        multipliers = model.multipliers(start)
-        middle = State(start.q + 0.5 * h * model.lift(start.q, start.v), start.v)
-        stiffness, inertia = model.stiffness(middle, multipliers)
-        stiffness = semidefinite_part(stiffness, inertia)
-        lag, none = self._alpha(h) * h / 6, jnp.zeros((0, 0), h.dtype)
-        if isinstance(stiffness, Assembled):
-            return _Frozen(step, stiffness, inertia, none, none, none)
-        inertia = as_dense(inertia)
-        jump = inverse(inertia + lag**2 * stiffness) @ (h / 6 * stiffness)
-        if isinstance(model, SeparableModel):
-            compliance = none
-            damping = inverse(jnp.eye(start.q.size, dtype=h.dtype) + lag * jump)
-        else:
-            compliance = inverse(inertia)
-            damping = none
-        return _Frozen(step, stiffness, inertia, compliance, jump, damping)
+        return freeze(step, self._alpha(h))
 
     def predict(
-        self, problem: _Frozen, acceleration: Velocities, multipliers: Multipliers
+        self, problem: Frozen, acceleration: Velocities, multipliers: Multipliers
     ) -> _Unknowns:
         guess = problem.step.guess(acceleration, multipliers)
         if not isinstance(problem.stiffness, Assembled):
@@ -153,7 +126,7 @@ class EnergyConsistent(AbstractSingleSolve[_Unknowns, _Frozen]):
         none = guess.momentum
         return JumpAndEnd(Increment(jnp.zeros_like(guess.rate), none, none, none), guess)
 
-    def residual(self, z: _Unknowns, problem: _Frozen) -> _Unknowns:
+    def residual(self, z: _Unknowns, problem: Frozen) -> _Unknowns:
         if not isinstance(z, JumpAndEnd):
             return self._rows(z, problem, *self._end(z, problem, None))
         h, alpha = problem.step.h, self._alpha(problem.step.h)
@@ -168,10 +141,10 @@ class EnergyConsistent(AbstractSingleSolve[_Unknowns, _Frozen]):
         return JumpAndEnd(jump_rows, self._rows(z.end, problem, end, jump_v))
 
     def _rows(
-        self, z: Increment, problem: _Frozen, end: State, jump_v: Velocities
+        self, z: Increment, problem: Frozen, end: State, jump_v: Velocities
     ) -> Increment:
         step, h = problem.step, problem.step.h
-        drive = step.drive(step.start, end, z)
+        drive = step.drive(step.start, end, z).less(step.step_load(end, z))
         twist = self._twist(z, problem, end.v - step.start.v)
         dissipation = h**2 / 12 * self._alpha(h) * (problem.stiffness @ jump_v)
         impulse = drive.impulse - h / 12 * twist.impulse + dissipation
@@ -181,63 +154,89 @@ class EnergyConsistent(AbstractSingleSolve[_Unknowns, _Frozen]):
             drift = drift - h / 12 * twist.drift + 0.5 * (jump_v - undamped)
         return step.rows(z, end, Drive(impulse, drift))
 
-    def finish(self, z: _Unknowns, problem: _Frozen) -> StepEnd:
+    def finish(self, z: _Unknowns, problem: Frozen) -> StepEnd:
         step, h, alpha = problem.step, problem.step.h, self._alpha(problem.step.h)
         z, jump = (z.end, z.jump.rate) if isinstance(z, JumpAndEnd) else (z, None)
         end, jump_v = self._end(z, problem, jump)
         dv = self._velocity(problem, end.v - step.start.v)
         jump_q = -h / 6 * (dv - alpha * jump_v)
         size = jump_q @ (problem.stiffness @ jump_q) + jump_v @ (problem.inertia @ jump_v)
+        load = step.step_load(end, z)
         return StepEnd(
-            end, h * z.rate, z.impulse / h, 0.5 * alpha * size, None, RESULTS.successful
+            end,
+            h * z.rate,
+            z.impulse / h,
+            0.5 * alpha * size,
+            None if load is None else load @ z.rate,
+            self._drive_work(z, problem, end),
+            None,
+            RESULTS.successful,
         )
+
+    def _drive_work(self, z: Increment, problem: Frozen, end: State) -> Scalar | None:
+        """The work of driven constraints, and what the twist adds to it."""
+        step = problem.step
+        if (work := step.drive_work(step.start, end, z)) is None:
+            return None
+        twist = self._twist(z, problem, end.v - step.start.v)
+        assert twist.work is not None
+        return work - step.h / 12 * twist.work
 
     def _alpha(self, h: Scalar) -> Scalar:
         return self.alpha.astype(h.dtype)
 
-    def _velocity(self, problem: _Frozen, dv: Velocities) -> Velocities:
+    def _velocity(self, problem: Frozen, dv: Velocities) -> Velocities:
         """A change of velocity, from what the states hold."""
         return problem.compliance @ dv if problem.step.model.has_own_momenta else dv
 
-    def _twist(self, z: Increment, problem: _Frozen, dv: Velocities) -> Drive:
+    def _twist(self, z: Increment, problem: Frozen, dv: Velocities) -> Drive:
         """`D J D (z1 - z0)`, `h` times in the first part, with `D` at the midpoint.
 
         It is orthogonal to `z1 - z0`, so it does no work. Where velocities are eliminated
-        only the first part is needed: `h K dv`.
+        only the first part is needed: `h K dv`. Where time enters it is a coordinate,
+        whose momentum nothing depends on.
         """
         step, model, h = problem.step, problem.step.model, problem.step.h
-        middle = step.start.q + 0.5 * h * z.rate
+        no_lapse = jax.tree.map(jnp.zeros_like, step.middle_time)
         if isinstance(model, SeparableModel):
-            return Drive(self._stiffness(z, model, h, middle, dv), dv[:0])
+            force, power = self._stiffness(z, problem, (dv, no_lapse))
+            return Drive(force, dv[:0], power)
         assert isinstance(model, CanonicalModel)
-        action = lambda q, p: h * model.hamiltonian(q, p) + z.impulse @ model.constraint(q)
-        forces = jax.grad(action, argnums=(0, 1))
-        at = middle, step.start.v + 0.5 * dv
+
+        def action(q: Coordinates, p: Velocities, t: Time) -> Scalar:
+            return h * model.hamiltonian(q, p) + z.impulse @ model.constraint(q, t)
+
+        forces = jax.grad(action, argnums=(0, 1, 2))
+        middle = step.start.q + 0.5 * h * z.rate
+        at = middle, step.start.v + 0.5 * dv, step.middle_time
         # h D: one factor h remains in the second product, and is divided out for `w_mu`.
-        _, (force, rate) = jax.jvp(forces, at, (h * z.rate, dv))
-        _, (force, rate) = jax.jvp(forces, at, (rate / h, -force / h))
-        return Drive(force, rate / h)
+        _, (force, rate, _) = jax.jvp(forces, at, (h * z.rate, dv, step.lapse))
+        _, (force, rate, power) = jax.jvp(forces, at, (rate / h, -force / h, no_lapse))
+        return Drive(force, rate / h, power)
 
     def _stiffness(
-        self, z: Increment, model: SeparableModel, h: Scalar, q: Coordinates, x: Coordinates
-    ) -> Coordinates:
-        """`h K x` at `q`."""
-        action = lambda q: h * model.strain(q, z.impulse / h)
-        return jax.jvp(jax.grad(action), (q,), (x,))[1]
+        self, z: Increment, problem: Frozen, along: tuple[Coordinates, Time]
+    ) -> tuple[Coordinates, Time]:
+        """`h K` at the midpoint times a vector, with its row and column of time."""
+        step, model, h = problem.step, problem.step.model, problem.step.h
+        assert isinstance(model, SeparableModel)
+        middle = step.start.q + 0.5 * h * z.rate, step.middle_time
+        action = lambda q, t: h * model.strain(q, t, z.impulse / h)
+        return jax.jvp(jax.grad(action, argnums=(0, 1)), middle, along)[1]
 
     def _end(
-        self, z: Increment, problem: _Frozen, jump: Velocities | None
+        self, z: Increment, problem: Frozen, jump: Velocities | None
     ) -> tuple[State, Velocities]:
         """The end of the step, and `j_v` of the dissipative jump, where it is not given."""
         step, model, h = problem.step, problem.step.model, problem.step.h
         start, dq, lag = step.start, h * z.rate, self._alpha(h) * h / 6
         if not isinstance(model, SeparableModel):
-            end = step.node(z)
+            end = step.node(z, step.end_time)
             dv = self._velocity(problem, end.v - start.v)
             return end, problem.jump @ (dq + lag * dv)
-        q1 = step.at(z)
-        reaction = model.mean_reaction(start.q, q1, z.velocity_impulse)
-        curved = self._stiffness(z, model, h, start.q + 0.5 * dq, dq)
+        q1, t1 = step.at(z), step.end_time
+        reaction = model.mean_reaction(start.q, start.t, q1, t1, z.velocity_impulse)
+        curved, _ = self._stiffness(z, problem, (dq, step.lapse))
         # The upper half of the step equations, solved for the change of velocity; what
         # the dissipative jump adds to them depends on that change itself.
         right = (
@@ -245,7 +244,7 @@ class EnergyConsistent(AbstractSingleSolve[_Unknowns, _Frozen]):
             - model.inverse_inertia @ (curved - h * (problem.stiffness @ dq)) / 6
         )
         if jump is not None:
-            return State(q1, start.v + right - jump), jump
+            return State(q1, start.v + right - jump, t1), jump
         pushed = problem.jump @ dq
         dv = problem.damping @ (right - pushed)
-        return State(q1, start.v + dv), pushed + lag * problem.jump @ dv
+        return State(q1, start.v + dv, t1), pushed + lag * problem.jump @ dv

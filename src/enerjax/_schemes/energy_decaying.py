@@ -10,6 +10,7 @@ from ._decaying import (
     as_alpha,
     jump_drive,
     jump_energy,
+    jump_loads,
     JumpAndEnd,
     predict_jump_and_end,
     split_velocities,
@@ -39,10 +40,12 @@ class EnergyDecaying(AbstractSingleSolve[JumpAndEnd, StepProblem]):
       `V` is convex over the jump. (With a Hamiltonian their sum is
       `(zj - z0) . (grad H(zj) - grad H(z0)) / 2`, and `H` must be convex.) On a linear
       oscillator of frequency `w` the step tends to `rho_inf = (1 - alpha) / (1 + alpha)`
-      as `h w` grows.
+      as `h w` grows. Forces enter the intervals like `-grad V`; a damper `-C v` with
+      constant `C` never feeds energy in.
     - Constraints held at: position level at `zj` and `z1`; with `formulation="ggl"`
       velocity level too.
-    - Order: 2. Unconstrained with `v = qdot`, 3 with `MeanValue()` or one coordinate.
+    - Order: 2. Unconstrained with `v = qdot`, 3 with `MeanValue()` or one coordinate, and
+      with linear dampers, but not with other forces.
       `"index3"` is the paper's: on constrained motion it tends to order 1, *locks* at
       `alpha = 0` and dissipates far too much above.
 
@@ -98,10 +101,12 @@ class EnergyDecaying(AbstractSingleSolve[JumpAndEnd, StepProblem]):
     def residual(self, z: JumpAndEnd, problem: StepProblem) -> JumpAndEnd:
         model, start, h = problem.model, problem.start, problem.h
         jump, end = self._nodes(z, problem)
-        after = problem.drive(jump, end, z.end)
-        before = problem.drive(start, jump, z.jump)
-        gradients = model.gradient(start, h), model.gradient(jump, h)
-        to_jump = jump_drive(self.alpha, after, before, *gradients)
+        loads = jump_loads(self.alpha, z, problem, jump, end)
+        after = problem.drive(jump, end, z.end).less(loads.after)
+        before = problem.drive(start, jump, z.jump).less(loads.before)
+        at_start = model.gradient(start, h).less(loads.start)
+        at_jump = model.gradient(jump, h).less(loads.jump)
+        to_jump = jump_drive(self.alpha, after, before, at_start, at_jump)
         return JumpAndEnd(
             problem.rows(z.jump, jump, to_jump), problem.rows(z.end, end, after)
         )
@@ -109,26 +114,31 @@ class EnergyDecaying(AbstractSingleSolve[JumpAndEnd, StepProblem]):
     def finish(self, z: JumpAndEnd, problem: StepProblem) -> StepEnd:
         jump, end = self._nodes(z, problem)
         kinetic, potential = jump_energy(problem, jump)
+        loads = jump_loads(self.alpha, z, problem, jump, end)
         return StepEnd(
             end,
             problem.h * z.end.rate,
             z.end.impulse / problem.h,
             self.alpha.astype(kinetic.dtype) * (kinetic + potential),
+            loads.work,
+            problem.drive_work(jump, end, z.end),
             None,
             RESULTS.successful,
         )
 
     def _nodes(self, z: JumpAndEnd, problem: StepProblem) -> tuple[State, State]:
         model, q0, v0 = problem.model, problem.start.q, problem.start.v
+        # The jump takes no time.
+        t0, t1 = problem.start.t, problem.end_time
         if not isinstance(model, SeparableModel):
-            return problem.node(z.jump), problem.node(z.end)
+            return problem.node(z.jump, t0), problem.node(z.end, t1)
         qj, q1 = problem.at(z.jump), problem.at(z.end)
-        after = model.mean_reaction(qj, q1, z.end.velocity_impulse)
-        before = model.mean_reaction(q0, qj, z.jump.velocity_impulse)
+        after = model.mean_reaction(qj, t0, q1, t1, z.end.velocity_impulse)
+        before = model.mean_reaction(q0, t0, qj, t0, z.jump.velocity_impulse)
         vj, v1 = split_velocities(
             self.alpha,
             v0,
-            2 * (model.push(q0, q1, z.end.rate) - after),  # eq. (47d): vj + v1
+            2 * (problem.velocity(z.end) - after),  # eq. (47d): vj + v1
             -6 * model.push(q0, qj, z.jump.rate) - 2 * (after - before),  # eq. (47e)
         )
-        return State(qj, vj), State(q1, v1)
+        return State(qj, vj, t0), State(q1, v1, t1)

@@ -21,7 +21,9 @@ class EnergyPreserving(AbstractSingleSolve[Increment, StepProblem]):
 
     Solves `S(z0, z1, DH(z0, z1)) = 0` with the constraints at the end of the step.
 
-    - Conserves: energy, to round-off, at any step.
+    - Conserves: energy, to round-off, at any step. With forces and drives it changes by
+      their work: that of a force in the middle of the step, at the velocity
+      `Lm (q1 - q0)/h`, so a damper never feeds energy in.
     - Dissipates: nothing, high-frequency noise included.
     - Constraints held at: position level; with `formulation="ggl"` velocity level too.
     - Order: 2. Symmetric: `Composed` raises the order to 4, 6 or 8.
@@ -64,14 +66,19 @@ class EnergyPreserving(AbstractSingleSolve[Increment, StepProblem]):
     def residual(self, z: Increment, problem: StepProblem) -> Increment:
         end = self._end(z, problem)
         drive = problem.drive(problem.start, end, z)
-        return problem.rows(z, end, drive)  # eq. (14a, c)
+        load = problem.step_load(end, z)
+        return problem.rows(z, end, drive.less(load))  # eq. (14a, c)
 
     def finish(self, z: Increment, problem: StepProblem) -> StepEnd:
+        end = self._end(z, problem)
+        load = problem.step_load(end, z)
         return StepEnd(
-            self._end(z, problem),
+            end,
             problem.h * z.rate,
             z.impulse / problem.h,
             jnp.zeros_like(problem.h),
+            None if load is None else load @ z.rate,
+            problem.drive_work(problem.start, end, z),
             None,
             RESULTS.successful,
         )
@@ -79,9 +86,9 @@ class EnergyPreserving(AbstractSingleSolve[Increment, StepProblem]):
     def _end(self, z: Increment, problem: StepProblem) -> State:
         model, start = problem.model, problem.start
         if not isinstance(model, SeparableModel):
-            return problem.node(z)
-        q1 = problem.at(z)
+            return problem.node(z, problem.end_time)
+        q1, t1 = problem.at(z), problem.end_time
         # eq. (14b), solved for the velocity
-        mean = model.push(start.q, q1, z.rate)
-        mean = mean - model.mean_reaction(start.q, q1, z.velocity_impulse)
-        return State(q1, 2 * mean - start.v)
+        mean = problem.velocity(z)
+        mean = mean - model.mean_reaction(start.q, start.t, q1, t1, z.velocity_impulse)
+        return State(q1, 2 * mean - start.v, t1)

@@ -12,6 +12,7 @@ from ._decaying import (
     as_alpha,
     jump_drive,
     jump_energy,
+    jump_loads,
     JumpAndEnd,
     predict_jump_and_end,
     split_velocities,
@@ -92,10 +93,14 @@ class KappaDecaying(AbstractSingleSolve[_Unknowns, StepProblem]):
         model, start, h = problem.model, problem.start, problem.h
         jump, end = self._nodes(z, problem)
         nodes, kappa = z.nodes, _kappa(z)
-        after = problem.drive(jump, end, _position_level(nodes.end))
-        before = problem.drive(start, jump, _position_level(nodes.jump))
+        loads = jump_loads(self.alpha, nodes, problem, jump, end)
+        after = problem.drive(jump, end, _position_level(nodes.end)).less(loads.after)
+        before = problem.drive(start, jump, _position_level(nodes.jump)).less(loads.before)
         work = self._kappa_row(z, problem, jump, end, after, before)
-        gradients = [model.gradient(state, h) for state in (start, jump)]
+        gradients = (
+            model.gradient(start, h).less(loads.start),
+            model.gradient(jump, h).less(loads.jump),
+        )
         scaled = [_scaled(kappa, x) for x in (after, before, *gradients)]
         if model.has_own_momenta:
             at_jump = model.reaction(jump, _eta(nodes.jump))
@@ -112,6 +117,7 @@ class KappaDecaying(AbstractSingleSolve[_Unknowns, StepProblem]):
     def finish(self, z: _Unknowns, problem: StepProblem) -> StepEnd:
         jump, end = self._nodes(z, problem)
         kinetic, potential = jump_energy(problem, jump)
+        loads = jump_loads(self.alpha, z.nodes, problem, jump, end)
         kappa = _kappa(z)
         # A kappa without value comes from an iterate that broke down for other reasons.
         bounded = ((kappa > 0) & (kappa < 2)) | ~jnp.isfinite(kappa)
@@ -120,6 +126,8 @@ class KappaDecaying(AbstractSingleSolve[_Unknowns, StepProblem]):
             problem.h * z.nodes.end.rate,
             z.nodes.end.impulse / problem.h,
             self.alpha.astype(kappa.dtype) * (kappa * kinetic + potential),
+            loads.work,
+            problem.drive_work(jump, end, _position_level(z.nodes.end)),
             kappa,
             RESULTS.where(bounded, RESULTS.successful, RESULTS.kappa_out_of_range),
         )
@@ -142,7 +150,7 @@ class KappaDecaying(AbstractSingleSolve[_Unknowns, StepProblem]):
         else:
             change = after.drift @ (end.v - jump.v) + before.drift @ (jump.v - v0)
         rate = lambda state, dv: jax.jvp(
-            lambda v: model.joint_rate(state.q, v), (state.v,), (dv,)
+            lambda v: model.joint_rate(state.q, v, state.t), (state.v,), (dv,)
         )[1]
         at_jump = rate(jump, end.v + jump.v - 2 * v0)
         at_end = rate(end, end.v - jump.v)
@@ -153,20 +161,21 @@ class KappaDecaying(AbstractSingleSolve[_Unknowns, StepProblem]):
     def _nodes(self, z: _Unknowns, problem: StepProblem) -> tuple[State, State]:
         model, q0, kappa = problem.model, problem.start.q, _kappa(z)
         jump, end = z.nodes.jump, z.nodes.end
+        t0, t1 = problem.start.t, problem.end_time
         if not isinstance(model, SeparableModel):
-            return problem.node(jump), problem.node(end)
+            return problem.node(jump, t0), problem.node(end, t1)
         qj, q1 = problem.at(jump), problem.at(end)
-        at_jump = model.reaction_at(qj, _eta(jump))
-        at_end = model.reaction_at(q1, _eta(end))
+        at_jump = model.reaction_at(qj, t0, _eta(jump))
+        at_end = model.reaction_at(q1, t1, _eta(end))
         vj, v1 = split_velocities(
             self.alpha,
             problem.start.v,
             # eq. (66c): vj + v1
-            (2 * model.push(q0, q1, end.rate) - (at_jump + at_end)) / kappa,
+            (2 * problem.velocity(end) - (at_jump + at_end)) / kappa,
             # eq. (66d)
             -(6 * model.push(q0, qj, jump.rate) + (at_end - at_jump)) / kappa,
         )
-        return State(qj, vj), State(q1, v1)
+        return State(qj, vj, t0), State(q1, v1, t1)
 
 
 def _kappa(z: _Unknowns) -> Scalar:

@@ -1,4 +1,9 @@
-from .base import AbstractSystem as AbstractSystem, State as State
+from .base import (
+    AbstractSystem as AbstractSystem,
+    Driven as Driven,
+    Force as Force,
+    State as State,
+)
 from .canonical import (
     AbstractCanonicalSystem as AbstractCanonicalSystem,
     HamiltonianSystem as HamiltonianSystem,

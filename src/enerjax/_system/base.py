@@ -13,23 +13,40 @@ or, for any Hamiltonian `H(q, p)`,
 so the force of a constraint on the coordinates is `-B^T lambda`, and a potential acts
 with `-dV/dq`. Units are the user's own, as long as they are consistent: a multiplier has
 the dimension of an energy per unit of its constraint.
+
+Where a system has forces `f(q, v, t)`, `L^T f` stands on the right of the first equation,
+and where it has driven constraints `g(q, t) = 0`, their rows stand in `Phi` and their
+`g_q^T lambda` beside `B^T lambda`: joints first, driven constraints next, relations between
+coordinates last.
 """
 
 import abc
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._linear import Symmetric
-from .._types import Args, Coordinates, Multipliers, Scalar
+from .._types import (
+    Args,
+    Coordinates,
+    JointMultipliers,
+    Multipliers,
+    Scalar,
+    Velocities,
+)
 
 
 def inexact(x: Any) -> Array:
     x = jnp.asarray(x)
     return x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(float)
+
+
+# `force(q, v, t, args)` and `driven(q, t, args)`.
+Force: TypeAlias = Callable[[Coordinates, Velocities, Scalar, Args], Velocities]
+Driven: TypeAlias = Callable[[Coordinates, Scalar, Args], JointMultipliers]
 
 
 class State(eqx.Module):
@@ -38,16 +55,27 @@ class State(eqx.Module):
     - `q`: coordinates, shape `(nq,)`, in the units of the user's own coordinates.
     - `v`: velocities, shape `(nv,)`: `L(q) qdot` of a system with `kinematics`, else
       `qdot`; of a `System.from_hamiltonian` the momenta `p`.
+    - `t`: the time, which schemes give to the states of a system with `force` or `driven`
+      while they work; `None` in all others, and in what users are given. To begin at
+      another time than 0 say so to `initial_state` and `simulate`.
     """
 
     q: Float[Array, "... nq"] = eqx.field(converter=inexact)
     v: Float[Array, "... nv"] = eqx.field(converter=inexact)
+    t: Float[Array, "..."] | None = None
 
 
 class AbstractSystem(eqx.Module):
-    """A conservative mechanical system with holonomic constraints."""
+    """A mechanical system with holonomic constraints, forces and drives."""
 
     constraint: eqx.AbstractVar[Callable[[Coordinates, Args], Multipliers] | None]
+    force: eqx.AbstractVar[Force | None]
+    driven: eqx.AbstractVar[Driven | None]
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether time enters at all."""
+        return self.force is not None or self.driven is not None
 
     @abc.abstractmethod
     def kinetic_energy(self, state: State, args: Args = None) -> Scalar:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Args, Coordinates, Multipliers, Scalar, Velocities
-from .base import AbstractSystem, check_function, State
+from .base import AbstractSystem, check_function, Driven, Force, State
 
 
 class AbstractCanonicalSystem(AbstractSystem):
@@ -39,11 +39,15 @@ class LagrangianSystem(AbstractCanonicalSystem):
     kinetic: Callable[[Coordinates, Velocities, Args], Scalar]
     potential: Callable[[Coordinates, Args], Scalar]
     constraint: Callable[[Coordinates, Args], Multipliers] | None = None
+    force: Force | None = None
+    driven: Driven | None = None
 
     def __check_init__(self):
         check_function("kinetic", "(q, qdot, args)", self.kinetic)
         check_function("potential", "(q, args)", self.potential)
         check_function("constraint", "(q, args)", self.constraint, optional=True)
+        check_function("force", "(q, qdot, t, args)", self.force, optional=True)
+        check_function("driven", "(q, t, args)", self.driven, optional=True)
 
     def kinetic_energy(self, state: State, args: Args = None) -> Scalar:
         return self.kinetic(state.q, state.v, args)
@@ -77,10 +81,14 @@ class HamiltonianSystem(AbstractCanonicalSystem):
 
     hamiltonian: Callable[[Coordinates, Coordinates, Args], Scalar]
     constraint: Callable[[Coordinates, Args], Multipliers] | None = None
+    force: Force | None = None
+    driven: Driven | None = None
 
     def __check_init__(self):
         check_function("hamiltonian", "(q, p, args)", self.hamiltonian)
         check_function("constraint", "(q, args)", self.constraint, optional=True)
+        check_function("force", "(q, qdot, t, args)", self.force, optional=True)
+        check_function("driven", "(q, t, args)", self.driven, optional=True)
 
     def kinetic_energy(self, state: State, args: Args = None) -> Scalar:
         """`H(q, p) - H(q, 0)`"""

@@ -11,12 +11,12 @@ from .._kinematics import (
 )
 from .._linear import BlockDiagonal, hessian, in_blocks, Symmetric
 from .._types import Args, Coordinates, Multipliers, Scalar, Velocities
-from .base import AbstractSystem, check_function, inexact, State
+from .base import AbstractSystem, check_function, Driven, Force, inexact, State
 from .canonical import HamiltonianSystem, LagrangianSystem
 
 
 class System(AbstractSystem):
-    """A conservative mechanical system with holonomic constraints.
+    """A mechanical system with holonomic constraints, forces and drives.
 
     **Arguments:**
 
@@ -32,6 +32,13 @@ class System(AbstractSystem):
       relations that the coordinates obey by definition, such as `p @ p - 1` for a unit
       quaternion. Its time derivative vanishes for every `v`, so it is imposed at
       position level only. Needs `kinematics`.
+    - `force`: `force(q, v, t, args)`, the forces that no potential has, shape `(nv,)`,
+      conjugate to `v`: their power is `force . v`. For a body with `v = (xdot, Omega)`
+      the force in space and the torque in body axes. Dampers, motors, loads that depend
+      on the time `t`. `Composed` cannot take them, and others are of order 2 with them.
+    - `driven`: `driven(q, t, args)`, a vector that vanishes in every admissible
+      configuration at time `t`: a pivot that is moved, a prescribed angle. Held as
+      `constraint` is, and twice differentiable in `t`.
 
     `args` is any pytree; the functions must be smooth and written with `jax.numpy`.
 
@@ -45,6 +52,8 @@ class System(AbstractSystem):
     constraint: Callable[[Coordinates, Args], Multipliers] | None
     kinematics: AbstractKinematics
     coordinate_constraint: Callable[[Coordinates, Args], Multipliers] | None
+    force: Force | None
+    driven: Driven | None
 
     def __init__(
         self,
@@ -54,6 +63,8 @@ class System(AbstractSystem):
         *,
         kinematics: Callable[[Coordinates, Args], Float[Array, "nv nq"]] | None = None,
         coordinate_constraint: Callable[[Coordinates, Args], Multipliers] | None = None,
+        force: Force | None = None,
+        driven: Driven | None = None,
     ):
         check_function("potential", "(q, args)", potential)
         for name, value in [
@@ -62,6 +73,8 @@ class System(AbstractSystem):
             ("coordinate_constraint", coordinate_constraint),
         ]:
             check_function(name, "(q, args)", value, optional=True)
+        check_function("force", "(q, v, t, args)", force, optional=True)
+        check_function("driven", "(q, t, args)", driven, optional=True)
         if coordinate_constraint is not None and kinematics is None:
             raise ValueError(
                 "`System(coordinate_constraint=...)` without `kinematics`: where the "
@@ -75,6 +88,8 @@ class System(AbstractSystem):
         self.potential = potential
         self.constraint = constraint
         self.coordinate_constraint = coordinate_constraint
+        self.force = force
+        self.driven = driven
         self.kinematics = (
             IdentityKinematics()
             if kinematics is None
@@ -107,6 +122,9 @@ class System(AbstractSystem):
         kinetic: Callable[[Coordinates, Velocities, Args], Scalar],
         potential: Callable[[Coordinates, Args], Scalar],
         constraint: Callable[[Coordinates, Args], Multipliers] | None = None,
+        *,
+        force: Force | None = None,
+        driven: Driven | None = None,
     ) -> LagrangianSystem:
         """A system whose inertia depends on its coordinates.
 
@@ -123,16 +141,27 @@ class System(AbstractSystem):
         - `potential`: `potential(q, args)`, a scalar (energy).
         - `constraint`: `constraint(q, args)`, a vector that vanishes in every admissible
           configuration. Leave it out if there is none.
+        - `force`: `force(q, qdot, t, args)`, shape `(nq,)`, conjugate to `qdot`.
+        - `driven`: `driven(q, t, args)`; see `System` for both.
 
         **Returns:** what all functions take for a `System`; the `v` of a `State` is
         `qdot`, shape `(nq,)`.
         """
-        return LagrangianSystem(kinetic=kinetic, potential=potential, constraint=constraint)
+        return LagrangianSystem(
+            kinetic=kinetic,
+            potential=potential,
+            constraint=constraint,
+            force=force,
+            driven=driven,
+        )
 
     @staticmethod
     def from_hamiltonian(
         hamiltonian: Callable[[Coordinates, Coordinates, Args], Scalar],
         constraint: Callable[[Coordinates, Args], Multipliers] | None = None,
+        *,
+        force: Force | None = None,
+        driven: Driven | None = None,
     ) -> HamiltonianSystem:
         """A system given by its Hamiltonian.
 
@@ -147,8 +176,12 @@ class System(AbstractSystem):
           `(q . p)^2 / 2` of a quaternion.
         - `constraint`: as for `from_lagrangian`. It is held in `q`, and
           `B(q) dH/dp = 0` in `p`.
+        - `force`: `force(q, qdot, t, args)`, shape `(nq,)`, conjugate to `qdot = dH/dp`.
+        - `driven`: `driven(q, t, args)`; see `System` for both.
 
         **Returns:** what all functions take for a `System`; the `v` of a `State` is the
         momentum `p`, shape `(nq,)`. The audit counts `H(q, 0)` as potential energy.
         """
-        return HamiltonianSystem(hamiltonian=hamiltonian, constraint=constraint)
+        return HamiltonianSystem(
+            hamiltonian=hamiltonian, constraint=constraint, force=force, driven=driven
+        )

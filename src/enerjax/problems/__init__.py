@@ -5,6 +5,7 @@ Units are SI. In the plane gravity acts along +y; in space along -z.
 """
 
 from ._base import Problem as Problem
+from ._driven import car_axis as car_axis
 from ._particles import (
     fput as fput,
     henon_heiles as henon_heiles,

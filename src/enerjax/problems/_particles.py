@@ -59,10 +59,9 @@ def _fput_potential(q: Coordinates, args: Args) -> Scalar:
 
 
 def fput(omega: Real = 50.0) -> Problem:
-    """Three stiff harmonic springs between soft quartic ones, after Fermi, Pasta, Ulam and
-    Tsingou.
+    """Stiff harmonic springs between soft quartic ones (Fermi, Pasta, Ulam, Tsingou).
 
-    Coordinates are the displaced centres of the stiff springs and their stretches, each
+    Coordinates are the displaced centres of three stiff springs and their stretches, each
     divided by `sqrt(2)`. The sum of the energies of the stiff springs hardly changes while
     they exchange it in a time of order `omega`.
 
