@@ -111,8 +111,15 @@ class PlanarBody(AbstractBody):
         return PlanarBodies()
 
     @staticmethod
-    def rod(name: str, mass: Real, start: Vector, end: Vector) -> "PlanarBody":
-        """A uniform slender rod between two points of the plane, at rest.
+    def rod(
+        name: str,
+        mass: Real,
+        start: Vector,
+        end: Vector,
+        velocity: Vector | None = None,
+        angular_velocity: Real = 0.0,
+    ) -> "PlanarBody":
+        """A uniform slender rod between two points of the plane.
 
         Its ends are `[-l/2, 0]` and `[l/2, 0]` in its frame, with the inertia `m l^2/12`.
         """
@@ -121,7 +128,15 @@ class PlanarBody(AbstractBody):
         xp, along = module_of(start, end), end - start
         length, angle = xp.sqrt(xp.sum(along**2)), xp.arctan2(along[1], along[0])
         mass = positive(part, "`mass`", mass)
-        return PlanarBody(name, mass, mass * length**2 / 12, (start + end) / 2, angle)
+        return PlanarBody(
+            name,
+            mass,
+            mass * length**2 / 12,
+            (start + end) / 2,
+            angle,
+            velocity=velocity,
+            angular_velocity=angular_velocity,
+        )
 
 
 class RigidBody(AbstractBody):
