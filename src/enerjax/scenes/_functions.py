@@ -85,9 +85,7 @@ def evaluate(group: Links, view: View, numbers: dict[str, Array]) -> Array:
     return jax.vmap(group.law)(a, b, numbers)
 
 
-def velocity_map(
-    layout: Layout, q: Coordinates, args: Parameters
-) -> Float[Array, "nv nq"]:
+def velocity_map(layout: Layout, q: Coordinates, args: Parameters) -> Float[Array, "nv nq"]:
     matrix = np.zeros((layout.num_velocities, layout.num_coordinates))
     plain = [group for group in layout.body_groups if not group.kind.num_redundant]
     for group in plain:

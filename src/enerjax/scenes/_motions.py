@@ -62,7 +62,7 @@ def gaps(
         slope = _slopes(group, view, numbers, size)
         measure = lambda x, slope=slope: jnp.linalg.norm(x / slope, axis=1)
         found.append((measure(value), measure(rate)))
-    for name, function in layout.constraints:
+    for _, function in layout.constraints:
         of_q = lambda x, function=function: function(View(layout, x), args)
         value, rate = jax.jvp(of_q, (q,), (qdot,))
         slope = jnp.linalg.norm(jax.jacfwd(of_q)(q), axis=1)

@@ -39,10 +39,11 @@ class Parameters(eqx.Module):
         if name is None:
             own = {key: _like(self.own, key, value) for key, value in numbers.items()}
             return Parameters(self.tables, self.own | own, self.layout)
-        section = next((s for s, names in self.layout.places.items() if name in names), None)
+        places = self.layout.places
+        section = next((key for key, names in places.items() if name in names), None)
         if section is None:
             raise ValueError(f"There is no part '{name}' with numbers of its own.")
-        group, row = self.layout.places[section][name]
+        group, row = places[section][name]
         table = dict(self.tables[section][group])
         for key, value in numbers.items():
             if key not in table:

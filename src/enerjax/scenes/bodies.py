@@ -99,7 +99,8 @@ class PlanarBody(AbstractBody):
         part = f"'{name}'"
         self.name = name
         self.numbers = dict(
-            mass=positive(part, "`mass`", mass), inertia=positive(part, "`inertia`", inertia)
+            mass=positive(part, "`mass`", mass),
+            inertia=positive(part, "`inertia`", inertia),
         )
         place = number(part, "`position`", position, (2,))
         self.q = _join(place, number(part, "`angle`", angle, ()))
@@ -123,17 +124,17 @@ class PlanarBody(AbstractBody):
 
         Its ends are `[-l/2, 0]` and `[l/2, 0]` in its frame, with the inertia `m l^2/12`.
         """
-        part = f"'{name}'"
-        start, end = (number(part, "an end", x, (2,)) for x in (start, end))
-        xp, along = module_of(start, end), end - start
-        length, angle = xp.sqrt(xp.sum(along**2)), xp.arctan2(along[1], along[0])
-        mass = positive(part, "`mass`", mass)
+        first = number(f"'{name}'", "`start`", start, (2,))
+        along = number(f"'{name}'", "`end`", end, (2,)) - first
+        xp = module_of(along)
+        turned = xp.arctan2(along[1], along[0])
+        mass = positive(f"'{name}'", "`mass`", mass)
         return PlanarBody(
             name,
             mass,
-            mass * length**2 / 12,
-            (start + end) / 2,
-            angle,
+            mass * xp.sum(along**2) / 12,
+            first + along / 2,
+            turned,
             velocity=velocity,
             angular_velocity=angular_velocity,
         )

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._initial import initial_state
+from .._initial import ConsistentStart, initial_state
 from .._solution import Solution
 from .._system import State, System
 from .._tracing import is_known
@@ -29,8 +29,12 @@ _FAR = 0.05
 
 
 class Reaction(NamedTuple):
-    """What a joint does to its second body, in space: shapes `(times, d)`, and `(times, 1)`
-    for the torque in the plane. The torque is about the joint's point on that body."""
+    """What a joint does to its second body, in space, at each saved time.
+
+    - `force`: shape `(times, d)`.
+    - `torque`: about the joint's point on that body, `(times, 3)`, in the plane
+      `(times, 1)`.
+    """
 
     force: Array
     torque: Array
@@ -124,14 +128,7 @@ class Scene:
         `position` is a length (an angle counts as an arc of the size of the scene),
         `velocity` its rate.
         """
-        found, _ = self._gaps()
-        names = [group.names for group in self._layout.joint_groups]
-        names += [(name,) for name, _ in self._layout.constraints]
-        return {
-            name: Gap(float(x), float(v))
-            for members, (xs, vs) in zip(names, found, strict=True)
-            for name, x, v in zip(members, xs, vs, strict=True)
-        }
+        return self._gaps()[0]
 
     def position(self, ys: State, body: str, point: Vector | None = None) -> Array:
         """A point of a body in space along a run, shape `(times, d)`; of one state `(d,)`.
@@ -158,11 +155,12 @@ class Scene:
         return self._along(lambda q, v: View(self._layout, q).angle(body), ys)
 
     def reaction(
-        self, sol: Solution, joint: str, args: Parameters | None = None
+        self, sol: Solution | ConsistentStart, joint: str, args: Parameters | None = None
     ) -> Reaction:
-        """Force and torque of a joint on its second body, along a run.
+        """Force and torque of a joint on its second body, along a run or at a start.
 
-        Multipliers are means over the step that ends at a row; they are taken there.
+        `args` are those of the run, where they are not the scene's own. Multipliers of a
+        run are means over the step that ends at a row, and are taken to act there.
         """
         args = self.args if args is None else args
         if joint not in self._rows or joint not in self._ends:
@@ -174,11 +172,15 @@ class Scene:
             a, b = (View(self._layout, q).frame(body) for body in self._ends[joint])
             return reaction(group, a, b, numbers, multipliers)
 
-        return Reaction(*jax.vmap(at)(sol.ys.q, self.multipliers(sol, joint)))
+        ys = sol.state if isinstance(sol, ConsistentStart) else sol.ys
+        at = at if ys.q.ndim == 1 else jax.vmap(at)
+        return Reaction(*at(ys.q, self.multipliers(sol, joint)))
 
-    def multipliers(self, sol: Solution, joint: str) -> Float[Array, "times rows"]:
+    def multipliers(
+        self, sol: Solution | ConsistentStart, joint: str
+    ) -> Float[Array, "... rows"]:
         """The multipliers of a joint or constraint of a scene, one column for each row."""
-        return sol.multipliers[:, self._rows[joint]]
+        return sol.multipliers[..., self._rows[joint]]
 
     def __str__(self) -> str:
         return summary(self._layout, self._kinds, self._ends, self._rows)
@@ -194,6 +196,11 @@ class Scene:
             rates = rates.at[group.q].set(lifted)
         return rates
 
+    def _members(self) -> list[tuple[str, ...]]:
+        """The names of all joints and constraints, as their rows follow each other."""
+        joined = [group.names for group in self._layout.joint_groups]
+        return joined + [(name,) for name, _ in self._layout.constraints]
+
     def _find_rows(self) -> dict[str, slice]:
         """The rows of the constraint that belong to each joint."""
         places, first = {}, 0
@@ -204,27 +211,35 @@ class Scene:
             found = [evaluate(group, view, numbers) for group, numbers in groups]
             return found + [f(view, self.args)[None] for _, f in self._layout.constraints]
 
-        names = [group.names for group in self._layout.joint_groups]
-        names += [(name,) for name, _ in self._layout.constraints]
-        for members, shape in zip(names, jax.eval_shape(sizes, self.q), strict=True):
+        for members, shape in zip(
+            self._members(), jax.eval_shape(sizes, self.q), strict=True
+        ):
             for name in members:
                 places[name] = slice(first, first + shape.shape[1])
                 first += shape.shape[1]
         return places
 
-    def _gaps(self) -> Any:
-        return gaps(self._layout, self.q, self._lift(self.q, self.v), self.args)
+    def _gaps(self) -> tuple[dict[str, Gap], float]:
+        """The gaps by name, and the size of the scene."""
+        rates = self._lift(self.q, self.v)
+        found, size = jax.device_get(gaps(self._layout, self.q, rates, self.args))
+        named = {
+            name: Gap(float(x), float(v))
+            for members, (xs, vs) in zip(self._members(), found, strict=True)
+            for name, x, v in zip(members, xs, vs, strict=True)
+        }
+        return named, float(size)
 
     def _check_gaps(self) -> None:
         if not self._rows or not is_known((self.q, self.v, self.args)):
             return
-        _, size = self._gaps()
-        for name, gap in self.report().items():
-            if gap.position > _FAR * float(size) and name in self._ends:
+        found, size = self._gaps()
+        for name, gap in found.items():
+            if gap.position > _FAR * size and name in self._ends:
                 a, b = self._ends[name]
                 raise ValueError(
                     f"'{name}' is off by {gap.position:.3g} at the start, in a scene of "
-                    f"size {float(size):.3g}: the poses of '{a}' and '{b}' do not fit its "
-                    "points, axes or length. Those are told in the frames of the bodies, "
-                    "whose origin is the mass centre."
+                    f"size {size:.3g}: the poses of '{a}' and '{b}' do not fit its points, "
+                    "axes or length. Those are told in the frames of the bodies, whose "
+                    "origin is the mass centre."
                 )
