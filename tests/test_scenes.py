@@ -6,13 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 import enerjax as ej
 from enerjax._linear.blocks import BlockDiagonal
 from enerjax._linear.pattern import jacobian_pattern
 
-from .helpers import problem, solve
+from .helpers import solve
 
 
 Point, Rod = ej.bodies.PointMass, ej.bodies.PlanarBody.rod
@@ -60,15 +59,15 @@ def test_numbers_are_found_and_set_by_name_and_differentiated():
         return run(system, start, args.set("outer", mass=mass), 50).ys.q[-1, 3]
 
     slope, h = jax.grad(tip)(1.0), 1e-4
-    difference = (tip(1.0 + h) - tip(1.0 - h)) / (2 * h)
-    assert slope == pytest.approx(difference, rel=1e-6)  # truncation of the difference
+    difference = float(tip(1.0 + h) - tip(1.0 - h)) / (2 * h)
+    assert float(slope) == pytest.approx(difference, rel=1e-6)  # truncation of the difference
 
     def energy(args):
         return system.energy(start, args)
 
     gradient = jax.grad(energy)(args)
-    assert gradient["bodies"]["outer"]["mass"] == pytest.approx(-9.81)
-    assert gradient["bodies"]["inner"]["mass"] == pytest.approx(0.0)
+    assert float(gradient["bodies"]["outer"]["mass"]) == pytest.approx(-9.81)
+    assert float(gradient["bodies"]["inner"]["mass"]) == pytest.approx(0.0)
     np.testing.assert_allclose(gradient["gravity"], [-2.0, -1.0])
     energies = jax.vmap(lambda g: energy(args.set(gravity=g)))(jnp.eye(2))
     np.testing.assert_allclose(energies, [-2.0, -1.0])
@@ -175,7 +174,7 @@ def test_forces_have_the_energies_that_they_say():
     stretch = np.hypot(3 - c, s) - 0.5
     expected = 4 * stretch**2 + 2.5 * 0.2**2 - (-s - 2 * c) - 0.7 * angle + 3 * angle
     energy = scene.system.potential(scene.q, scene.args)
-    assert energy == pytest.approx(expected, rel=1e-14)
+    assert float(energy) == pytest.approx(expected, rel=1e-14)
 
 
 def test_a_torsion_spring_in_space_measures_the_turn_about_its_axis():
@@ -187,7 +186,7 @@ def test_a_torsion_spring_in_space_measures_the_turn_about_its_axis():
         "arm", 2.0, [0.3, 0.4, 0.5], [0.0, 0, 0], [np.cos(half), 0, 0, np.sin(half)]
     )
     energy = scene.system.potential(jnp.asarray(turned.q), scene.args)
-    assert energy == pytest.approx(2.5 * 1.2**2, rel=1e-14)
+    assert float(energy) == pytest.approx(2.5 * 1.2**2, rel=1e-14)
 
 
 def test_constraints_of_your_own_stand_beside_joints():
@@ -197,8 +196,8 @@ def test_constraints_of_your_own_stand_beside_joints():
     scene = ej.Scene(pendulum_parts(level), [0.0, 9.81], dict(height=1.0))
     values = scene.system.constraint(scene.q, scene.args)
     np.testing.assert_allclose(values, 0, atol=1e-15)
-    assert scene._rows["level"] == slice(2, 3)
-    assert "1 degrees of freedom" in str(scene)
+    assert "constraint[2:3]" in str(scene)
+    assert "1 degree of freedom" in str(scene)
 
 
 def test_a_scene_is_told_in_words():

@@ -14,9 +14,10 @@ def summary(
     internal = sum(kind.num_internal for kind in bodies.values())
     held = sum(place.stop - place.start for place in rows.values())
     world = "the plane" if layout.dimension == 2 else "space"
+    freedom = layout.num_velocities - internal - held
     lines = [
         f"A scene in {world}: {layout.num_coordinates} coordinates, {held} constraints of "
-        f"joints, {layout.num_velocities - internal - held} degrees of freedom."
+        f"joints, {freedom} degree{'' if freedom == 1 else 's'} of freedom."
     ]
     width = max(len(name) for name in kinds)
     line = lambda name, text: f"  {name:{width}}  {kinds[name]:14}  {text}".rstrip()
