@@ -192,9 +192,14 @@ def test_classes_are_abstract_or_final(cls):
 
 
 def public():
-    for owner in (ej, ej.problems, ej.bodies, ej.joints, ej.forces):
+    for owner in (ej, ej.problems):
         for name, value in vars(owner).items():
             if not name.startswith("_") and not inspect.ismodule(value):
+                yield f"{owner.__name__}.{name}", value
+    for owner in (ej.bodies, ej.joints, ej.forces):
+        for name, value in vars(owner).items():
+            here = getattr(value, "__module__", None) == owner.__name__
+            if not name.startswith("_") and here:
                 yield f"{owner.__name__}.{name}", value
 
 

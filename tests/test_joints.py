@@ -15,8 +15,8 @@ CURVE = lambda x, numbers: jnp.stack(
     [x[2] - numbers["depth"] * x[0] ** 2, x[1] - jnp.sin(x[0])]
 )
 # How a joint is made between two bodies, from a point on the first; and the motions that
-# it leaves to the second body at that point: (velocity, angular velocity), for both parallel
-# to space.
+# it leaves to the second body at that point, (velocity, angular velocity), where both are
+# parallel to space.
 JOINTS = {
     "spherical": (
         lambda name, a, b, at: ej.joints.Spherical(name, a, b, at),
@@ -70,7 +70,8 @@ def on_ground(name):
 def test_a_joint_leaves_its_own_freedom_and_carries_the_rest(name):
     scene, motions = on_ground(name), JOINTS[name][1]
     system, q, args = scene.system, scene.q, scene.args
-    jacobian = np.asarray(jax.jacfwd(lambda q: system.constraint(q, args))(q))
+    assert system.constraint is not None
+    jacobian = np.asarray(jax.jacfwd(system.constraint)(q, args))
     # Six constraints of the directors, and those of the joint.
     assert np.linalg.matrix_rank(jacobian) == len(jacobian) == 6 + 6 - len(motions)
     for velocity, spin in motions:

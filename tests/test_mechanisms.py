@@ -51,7 +51,9 @@ PENDULUM = [
 ]
 
 
-@pytest.mark.parametrize(("scheme", "bound"), [("preserving", 4.7e-3), ("composed 4", 1e-6)])
+@pytest.mark.parametrize(
+    ("scheme", "bound"), [("preserving", 4.7e-3), ("composed 4", 1e-6)]
+)
 def test_the_pendulum_of_the_benchmark(scheme, bound):
     solution = run(made("point_pendulum"), scheme, 0.01, 1000)
     for t, x, y in PENDULUM:

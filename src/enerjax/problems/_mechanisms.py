@@ -1,4 +1,4 @@
-"""Mechanisms made of parts; in the plane gravity acts along -y here, as in their sources."""
+"""Mechanisms made of parts; gravity acts along -y here, as in their sources."""
 
 from collections.abc import Sequence
 
@@ -24,7 +24,7 @@ def point_pendulum(g: Real = 9.81) -> Problem:
     """
     point = bodies.PointMass("point", 1.0, [-1.0, 0.0])
     rod = joints.Distance("rod", "ground", "point")
-    return _made(Scene([point, rod], gravity=[0.0, -g]))
+    return _made(Scene([point, rod], gravity=jnp.array([0.0, -1.0]) * g))
 
 
 def slider_crank(
@@ -36,7 +36,7 @@ def slider_crank(
     """
     top = jnp.array([0.0, crank])
     pin = jnp.array([(rod**2 - crank**2) ** 0.5, 0.0])
-    moving = jnp.array([-speed * crank, 0.0])
+    moving = jnp.array([-1.0, 0.0]) * speed * crank
     parts = [
         bodies.PlanarBody.rod("crank", mass, [0, 0], top, moving / 2, speed),
         bodies.PlanarBody.rod("rod", mass, top, pin, moving),
@@ -81,11 +81,11 @@ def parallel_bars(num_cells: int = 2, speed: Real = 1.0) -> Problem:
     """
     parts: list = []
     foot, top = [-0.5, 0.0], [0.5, 0.0]
-    rod = bodies.PlanarBody.rod
+    rod, moving = bodies.PlanarBody.rod, jnp.array([1.0, 0.0]) * speed
     for k in range(num_cells + 1):
         upright = f"upright {k}"
         parts += [
-            rod(upright, 1.0, [k, 0], [k, 1], jnp.array([speed / 2, 0]), -speed),
+            rod(upright, 1.0, [k, 0], [k, 1], moving / 2, -moving[0]),
             joints.Revolute(f"foot {k}", "ground", upright, [k, 0]),
         ]
         if k > 0:
@@ -93,7 +93,7 @@ def parallel_bars(num_cells: int = 2, speed: Real = 1.0) -> Problem:
         if k < num_cells:
             level = f"level {k + 1}"
             parts += [
-                rod(level, 1.0, [k, 1], [k + 1, 1], jnp.array([speed, 0])),
+                rod(level, 1.0, [k, 1], [k + 1, 1], moving),
                 joints.Revolute(f"left {k + 1}", upright, level, top, foot),
             ]
     return _made(Scene(parts, gravity=_EARTH))

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._types import Scalar
+from .._types import Coordinates, Multipliers, Scalar, Velocities
 from ._frames import Numbers, Point
 
 
@@ -39,40 +39,40 @@ class AbstractKind(abc.ABC):
     def num_velocities(self) -> int:
         return self.num_coordinates - self.num_redundant
 
-    def origin(self, q: Point) -> Point:
+    def origin(self, q: Coordinates) -> Point:
         """The mass centre in space."""
         return q[: self.dimension]
 
-    def axes(self, q: Point) -> Float[Array, "d d"]:
+    def axes(self, q: Coordinates) -> Float[Array, "d d"]:
         """The body axes in space, as rows."""
         return jnp.eye(self.dimension, dtype=q.dtype)
 
-    def angle(self, q: Point) -> Scalar:
+    def angle(self, q: Coordinates) -> Scalar:
         """The angle of rotation, in the plane."""
         return jnp.zeros((), q.dtype)
 
     @abc.abstractmethod
-    def kinetic(self, v: Point, numbers: Numbers) -> Scalar:
+    def kinetic(self, v: Velocities, numbers: Numbers) -> Scalar:
         """The kinetic energy, quadratic in `v`."""
 
-    def internal(self, q: Point) -> Point:
+    def internal(self, q: Coordinates) -> Multipliers:
         """Constraints between the coordinates."""
         return jnp.zeros((0,), q.dtype)
 
-    def redundant(self, q: Point) -> Point:
+    def redundant(self, q: Coordinates) -> Multipliers:
         """Relations of redundant coordinates."""
         return jnp.zeros((0,), q.dtype)
 
-    def velocity_map(self, q: Point) -> Float[Array, "nv nq"]:
+    def velocity_map(self, q: Coordinates) -> Float[Array, "nv nq"]:
         """`L(q)` in `v = L(q) qdot`."""
         return jnp.eye(self.num_coordinates, dtype=q.dtype)
 
-    def lift(self, q: Point, v: Point) -> Point:
+    def lift(self, q: Coordinates, v: Velocities) -> Coordinates:
         """The rates of the coordinates."""
         return v
 
 
-def translation(v: Point, numbers: Numbers) -> Scalar:
+def translation(v: Velocities, numbers: Numbers) -> Scalar:
     return 0.5 * numbers["mass"] * jnp.sum(v**2)
 
 

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
-from .._types import Scalar
+from .._types import Multipliers, Scalar
 from ._frames import Frame, Numbers, Point
 
 
@@ -47,7 +47,7 @@ class Alignment(AbstractLaw):
     def has_frames(self) -> bool:
         return bool(self.square or self.along)
 
-    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Point:
+    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Multipliers:
         apart = offset(a, b, numbers)
         if not self.has_frames:
             return apart
@@ -62,15 +62,15 @@ class Alignment(AbstractLaw):
 
 @dataclass(frozen=True)
 class Length(AbstractLaw):
-    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Point:
+    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Multipliers:
         return (jnp.sum(offset(a, b, numbers) ** 2) - numbers["length"] ** 2)[None]
 
 
 @dataclass(frozen=True)
 class Curve(AbstractLaw):
-    function: Callable[[Point, Numbers], Point]
+    function: Callable[[Point, Numbers], Multipliers]
 
-    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Point:
+    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Multipliers:
         apart = b.point(numbers["point_b"]) - a.origin
         if a.axes is not None:
             apart = jnp.sum(a.axes * apart[None], axis=1)

@@ -80,16 +80,20 @@ class TorsionSpring(AbstractForce):
 
 
 class ConstantForce(AbstractForce):
-    """A force that keeps its direction in space, on a point of a body.
+    """A force on a point of a `body` that keeps its direction in space.
 
     `force` has two or three entries; `point` is the mass centre if it is not given.
     """
 
     name: str
+    a: str
     b: str
     force: Vector
-    point: Vector | None = None
-    a: str = GROUND
+    point: Vector | None
+
+    def __init__(self, name: str, body: str, force: Vector, point: Vector | None = None):
+        self.name, self.a, self.b = name, GROUND, body
+        self.force, self.point = force, point
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         force = number(ends.part, "`force`", self.force, (ends.dimension,))
@@ -98,12 +102,19 @@ class ConstantForce(AbstractForce):
 
 
 class ConstantTorque(AbstractForce):
-    """A constant torque on a body in the plane, counterclockwise; minus it acts on `a`."""
+    """A constant torque on a `body` in the plane, counterclockwise.
+
+    Its opposite acts on `reacting`.
+    """
 
     name: str
+    a: str
     b: str
     torque: Real
-    a: str = GROUND
+
+    def __init__(self, name: str, body: str, torque: Real, reacting: str = GROUND):
+        self.name, self.a, self.b = name, reacting, body
+        self.torque = torque
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         ends.only_in_plane("A constant torque has a potential only in the plane")
