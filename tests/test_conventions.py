@@ -31,7 +31,9 @@ LAYERS = [
     {"_check"},
     {"_solve"},
     {"_step", "_initial", "_reverse", "_analysis"},
-    {"_simulate", "problems"},
+    {"_simulate"},
+    {"scenes"},
+    {"problems"},
     {"_report"},
     {"__main__"},
 ]
@@ -123,7 +125,12 @@ def test_the_run_knows_no_scheme_by_name():
 
 def test_problems_are_made_of_what_users_have():
     used = {x for path in files_of("problems") for x in parts_imported(path)} - {"problems"}
-    assert used <= {"_types", "_system", "_initial"}
+    assert used <= {"_types", "_system", "_initial", "scenes"}
+
+
+def test_scenes_stand_on_what_users_have():
+    used = {x for path in files_of("scenes") for x in parts_imported(path)} - {"scenes"}
+    assert used <= {"_types", "_tracing", "_system", "_initial", "_solution"}
 
 
 @pytest.mark.parametrize("path", SOURCES + TESTS, ids=lambda path: path.name)
@@ -188,6 +195,11 @@ def public():
     for owner in (ej, ej.problems):
         for name, value in vars(owner).items():
             if not name.startswith("_") and not inspect.ismodule(value):
+                yield f"{owner.__name__}.{name}", value
+    for owner in (ej.bodies, ej.joints, ej.forces):
+        for name, value in vars(owner).items():
+            here = getattr(value, "__module__", None) == owner.__name__
+            if not name.startswith("_") and here:
                 yield f"{owner.__name__}.{name}", value
 
 

@@ -46,6 +46,15 @@ from ._system import (
     State as State,
     System as System,
 )
+from .scenes import (
+    bodies as bodies,
+    forces as forces,
+    Gap as Gap,
+    joints as joints,
+    Parameters as Parameters,
+    Reaction as Reaction,
+    Scene as Scene,
+)
 
 
 __version__ = _version("enerjax")

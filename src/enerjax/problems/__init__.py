@@ -1,11 +1,20 @@
 """The paper's test cases and benchmark mechanisms, as `(system, start, args)`.
 
 Each function builds a `Problem`; calls with other numbers share one compiled program.
-Units are SI. In the plane gravity acts along +y; in space along -z.
+Units are SI. In the plane gravity acts along +y, in the mechanisms along -y;
+in space along -z.
 """
 
 from ._base import Problem as Problem
 from ._driven import car_axis as car_axis
+from ._mechanisms import (
+    four_bar as four_bar,
+    parallel_bars as parallel_bars,
+    point_pendulum as point_pendulum,
+    slider_crank as slider_crank,
+    spatial_four_bar as spatial_four_bar,
+    squeezer as squeezer,
+)
 from ._particles import (
     fput as fput,
     henon_heiles as henon_heiles,

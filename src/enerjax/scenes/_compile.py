@@ -1,0 +1,153 @@
+"""From a list of parts to a layout and its numbers."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._tracing import is_known
+from .._types import Coordinates
+from ._frames import Frame, GROUND, Numbers
+from ._layout import Layout, Link, numbers_of
+from ._numbers import module_of, number
+from ._parameters import Parameters
+from ._start import Ends
+from ._view import View
+from .bodies import AbstractBody
+from .forces import AbstractForce, Potential
+from .joints import AbstractJoint, Constraint
+
+
+def sort_parts(parts: Sequence[Any]) -> dict[type, list[Any]]:
+    """The parts by what they are, if names and plane or space fit together."""
+    kinds = (AbstractBody, AbstractJoint, AbstractForce, Constraint, Potential)
+    found: dict[type, list[Any]] = {kind: [] for kind in kinds}
+    names = {GROUND}
+    for part in parts:
+        kind = next((kind for kind in kinds if isinstance(part, kind)), None)
+        if kind is None:
+            raise TypeError(f"A scene is made of bodies, joints and forces, got {part!r}.")
+        if not isinstance(part.name, str):
+            raise TypeError(f"A name must be a string, got {part.name!r}.")
+        if part.name in names:
+            raise ValueError(f"There are two parts with the name '{part.name}'.")
+        names.add(part.name)
+        found[kind].append(part)
+    bodies = found[AbstractBody]
+    if not bodies:
+        raise ValueError("There is no body in the scene: nothing can move.")
+    for body in bodies:
+        if body.kind.dimension != bodies[0].kind.dimension:
+            raise ValueError(
+                f"'{body.name}' is in {_world(body)}, but '{bodies[0].name}' in "
+                f"{_world(bodies[0])}: a scene has one or the other."
+            )
+    return found
+
+
+def _world(body: AbstractBody) -> str:
+    return "the plane" if body.kind.dimension == 2 else "space"
+
+
+def compile_parts(
+    found: dict[type, list[Any]], gravity: Any, own: dict[str, Any]
+) -> tuple[Layout, Parameters]:
+    """Where all parts stand, and their numbers."""
+    bodies = found[AbstractBody]
+    named = tuple((body.name, body.kind) for body in bodies)
+    rows = numbers_of(named)
+    ends = _StartPose(bodies, rows)
+    resolved = {
+        kind: [(part, *part.resolve(ends(part))) for part in found[kind]]
+        for kind in (AbstractJoint, AbstractForce)
+    }
+    links = {
+        kind: tuple(
+            Link(part.name, law, rows[part.a], rows[part.b]) for part, law, _ in parts
+        )
+        for kind, parts in resolved.items()
+    }
+    layout = Layout(
+        dimension=bodies[0].kind.dimension,
+        bodies=named,
+        joints=links[AbstractJoint],
+        forces=links[AbstractForce],
+        constraints=tuple((part.name, part.function) for part in found[Constraint]),
+        potentials=tuple((part.name, part.function) for part in found[Potential]),
+        has_gravity=gravity is not None,
+    )
+    tables = dict(
+        bodies=_tables(layout.body_groups, {b.name: b.numbers for b in bodies}),
+        joints=_tables(layout.joint_groups, _by_name(resolved[AbstractJoint])),
+        forces=_tables(layout.force_groups, _by_name(resolved[AbstractForce])),
+    )
+    return layout, Parameters(tables, _own(own, gravity, layout, tables), layout)
+
+
+def _own(own: dict[str, Any], gravity: Any, layout: Layout, tables: Any) -> dict[str, Any]:
+    for key in (*tables, "gravity"):
+        if key in own:
+            raise ValueError(f"`args` of a scene must not hold '{key}': it has its own.")
+    if gravity is None:
+        return own
+    vector = number("the scene", "`gravity`", gravity, (layout.dimension,))
+    return own | dict(gravity=jnp.asarray(vector) * 1.0)
+
+
+def _by_name(resolved: list[tuple]) -> dict[str, Numbers]:
+    return {part.name: numbers for part, _, numbers in resolved}
+
+
+def _tables(groups: Sequence[Any], numbers: dict[str, Numbers]) -> tuple[Numbers, ...]:
+    """For every group one table for each of its numbers, one row for each part."""
+    tables = []
+    for group in groups:
+        members = [numbers[name] for name in group.names]
+        table = {}
+        for key in members[0]:
+            entries = [member[key] for member in members]
+            if any(np.shape(x) != np.shape(entries[0]) for x in entries):
+                raise ValueError(f"`{key}` of {[*group.names]} must be of one shape.")
+            table[key] = jnp.asarray(module_of(entries).stack(entries))
+        tables.append(table)
+    return tuple(tables)
+
+
+class _StartPose:
+    """Finds the bodies that a part connects, as they start."""
+
+    def __init__(self, bodies: Sequence[AbstractBody], rows: dict[str, int]):
+        kinds = tuple((body.name, body.kind) for body in bodies)
+        self._layout = Layout(bodies[0].kind.dimension, kinds, (), (), (), (), False)
+        self._rows = rows
+        q = join([body.q for body in bodies])
+        frames = _all_frames(self._layout, jnp.asarray(q))
+        self._frames = jax.device_get(frames) if is_known(frames) else frames
+
+    def __call__(self, part: Any) -> Ends:
+        for body in (part.a, part.b):
+            if body not in self._rows:
+                raise ValueError(
+                    f"'{part.name}' connects '{body}', but there is no such body. There "
+                    f"are {[name for name in self._rows]}."
+                )
+        if part.a == part.b:
+            raise ValueError(f"'{part.name}' connects '{part.a}' with itself.")
+        numbers = self._rows[part.a], self._rows[part.b]
+        a, b = (jax.tree.map(lambda x, k=k: x[k], self._frames) for k in numbers)
+        turns = [k == 0 or bool(self._layout.turning[k]) for k in numbers]
+        return Ends(f"'{part.name}'", (part.a, part.b), (a, b), (turns[0], turns[1]))
+
+
+@eqx.filter_jit
+def _all_frames(layout: Layout, q: Coordinates) -> Frame:
+    view = View(layout, q)
+    return Frame(view.origins, view.axes, view.angles)
+
+
+def join(parts: Sequence[Any]) -> Array:
+    return jnp.asarray(module_of(parts).concatenate(parts))

@@ -1,0 +1,193 @@
+"""The coordinates of bodies: what all bodies of one kind have in common.
+
+Each is a set of plain functions of the coordinates `q` and velocities `v` of one body.
+Kinds are compared by value, so scenes that are made alike share their programs.
+"""
+
+import abc
+from dataclasses import dataclass
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._types import Coordinates, Multipliers, Scalar, Velocities
+from ._frames import Numbers, Point
+
+
+class AbstractKind(abc.ABC):
+    """How a body of some kind moves.
+
+    - `dimension`: 2 in the plane, 3 in space.
+    - `turns`: whether the body has an orientation.
+    - `num_coordinates`, `num_velocities`: of one body.
+    - `num_internal`: constraints between the coordinates of one body, for which the rate
+      must be held too; those that hold by definition are `num_redundant`.
+    """
+
+    dimension: int
+    turns: ClassVar[bool]
+    num_internal: ClassVar[int] = 0
+    num_redundant: ClassVar[int] = 0
+
+    @property
+    @abc.abstractmethod
+    def num_coordinates(self) -> int: ...
+
+    @property
+    def num_velocities(self) -> int:
+        return self.num_coordinates - self.num_redundant
+
+    def origin(self, q: Coordinates) -> Point:
+        """The mass centre in space."""
+        return q[: self.dimension]
+
+    def axes(self, q: Coordinates) -> Float[Array, "d d"]:
+        """The body axes in space, as rows."""
+        return jnp.eye(self.dimension, dtype=q.dtype)
+
+    def angle(self, q: Coordinates) -> Scalar:
+        """The angle of rotation, in the plane."""
+        return jnp.zeros((), q.dtype)
+
+    @abc.abstractmethod
+    def kinetic(self, v: Velocities, numbers: Numbers) -> Scalar:
+        """The kinetic energy, quadratic in `v`."""
+
+    def internal(self, q: Coordinates) -> Multipliers:
+        """Constraints between the coordinates."""
+        return jnp.zeros((0,), q.dtype)
+
+    def redundant(self, q: Coordinates) -> Multipliers:
+        """Relations of redundant coordinates."""
+        return jnp.zeros((0,), q.dtype)
+
+    def velocity_map(self, q: Coordinates) -> Float[Array, "nv nq"]:
+        """`L(q)` in `v = L(q) qdot`."""
+        return jnp.eye(self.num_coordinates, dtype=q.dtype)
+
+    def lift(self, q: Coordinates, v: Velocities) -> Coordinates:
+        """The rates of the coordinates."""
+        return v
+
+
+def translation(v: Velocities, numbers: Numbers) -> Scalar:
+    return 0.5 * numbers["mass"] * jnp.sum(v**2)
+
+
+@dataclass(frozen=True)
+class Points(AbstractKind):
+    """`q`: position."""
+
+    dimension: int
+    turns = False
+
+    @property
+    def num_coordinates(self) -> int:
+        return self.dimension
+
+    def kinetic(self, v, numbers):
+        return translation(v, numbers)
+
+
+@dataclass(frozen=True)
+class PlanarBodies(AbstractKind):
+    """`q`: mass centre and angle."""
+
+    dimension: int = 2
+    turns = True
+
+    @property
+    def num_coordinates(self) -> int:
+        return 3
+
+    def axes(self, q):
+        c, s = jnp.cos(q[2]), jnp.sin(q[2])
+        return jnp.stack([jnp.stack([c, s]), jnp.stack([-s, c])])
+
+    def angle(self, q):
+        return q[2]
+
+    def kinetic(self, v, numbers):
+        return translation(v[:2], numbers) + 0.5 * numbers["inertia"] * v[2] ** 2
+
+
+# The six products of three axes.
+_LEFT, _RIGHT = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
+
+
+@dataclass(frozen=True)
+class DirectorBodies(AbstractKind):
+    """`q`: mass centre and the three body axes, as vectors in space."""
+
+    dimension: int = 3
+    turns = True
+    num_internal = 6
+
+    @property
+    def num_coordinates(self) -> int:
+        return 12
+
+    def axes(self, q):
+        return q[3:].reshape(3, 3)
+
+    def kinetic(self, v, numbers):
+        inertia, rates = numbers["inertia"], v[3:].reshape(3, 3)
+        # The second moments of the mass: those of inertia are sums of two of them.
+        moments = 0.5 * jnp.trace(inertia) * jnp.eye(3, dtype=v.dtype) - inertia
+        turning = 0.5 * jnp.sum(moments * (rates @ rates.T))
+        return translation(v[:3], numbers) + turning
+
+    def internal(self, q):
+        axes = self.axes(q)
+        products = jnp.sum(axes[np.array(_LEFT)] * axes[np.array(_RIGHT)], axis=1)
+        return products - jnp.array([1, 1, 1, 0, 0, 0], q.dtype)
+
+
+def rotation(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
+    """The rotation matrix of a unit quaternion, scalar first: body axes along columns."""
+    scalar, vector = p[0], p[1:]
+    x, y, z = vector
+    zero = jnp.zeros_like(x)
+    cross = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+    isotropic = (scalar**2 - vector @ vector) * jnp.eye(3, dtype=p.dtype)
+    return isotropic + 2 * (jnp.outer(vector, vector) + scalar * cross)
+
+
+@dataclass(frozen=True)
+class QuaternionBodies(AbstractKind):
+    """`q`: mass centre and unit quaternion; `v`: its velocity, and the angular velocity
+    in body axes."""
+
+    dimension: int = 3
+    turns = True
+    num_redundant = 1
+
+    @property
+    def num_coordinates(self) -> int:
+        return 7
+
+    def axes(self, q):
+        return rotation(q[3:]).T
+
+    def kinetic(self, v, numbers):
+        spin = v[3:]
+        return translation(v[:3], numbers) + 0.5 * spin @ numbers["inertia"] @ spin
+
+    def redundant(self, q):
+        return jnp.sum(q[3:] ** 2)[None] - 1
+
+    def _rates(self, p: Float[Array, "4"]) -> Float[Array, "3 4"]:
+        """`2 E(p)` in `Omega = 2 E(p) pdot`."""
+        a, b, c, d = p
+        rows = [[-b, a, d, -c], [-c, -d, a, b], [-d, c, -b, a]]
+        return 2 * jnp.stack([jnp.stack(row) for row in rows])
+
+    def velocity_map(self, q):
+        corner = jnp.zeros((3, 4), q.dtype)
+        eye = jnp.eye(3, dtype=q.dtype)
+        return jnp.block([[eye, corner], [corner[:, :3], self._rates(q[3:])]])
+
+    def lift(self, q, v):
+        return jnp.concatenate([v[:3], 0.25 * v[3:] @ self._rates(q[3:])])

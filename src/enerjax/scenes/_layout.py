@@ -1,0 +1,139 @@
+"""Where the parts of a scene stand: tables of integers, known before anything is traced."""
+
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ._frames import GROUND
+from ._kinds import AbstractKind
+from ._laws import AbstractLaw
+
+
+class Link(NamedTuple):
+    """A joint or force: its law, and the numbers of its bodies; the ground is 0."""
+
+    name: str
+    law: AbstractLaw
+    a: int
+    b: int
+
+
+class Bodies(NamedTuple):
+    """All bodies of a kind: names, and their coordinates and velocities, row by row."""
+
+    kind: AbstractKind
+    names: tuple[str, ...]
+    q: np.ndarray
+    v: np.ndarray
+
+
+class Links(NamedTuple):
+    """All joints or forces of a law."""
+
+    law: AbstractLaw
+    names: tuple[str, ...]
+    a: np.ndarray
+    b: np.ndarray
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The structure of a scene, without its numbers; compared by value.
+
+    Coordinates and velocities stand body by body, in the order of the parts. Bodies are
+    numbered kind by kind from 1 on, so that a table of all frames is a concatenation.
+    """
+
+    dimension: int
+    bodies: tuple[tuple[str, AbstractKind], ...]
+    joints: tuple[Link, ...]
+    forces: tuple[Link, ...]
+    constraints: tuple[tuple[str, Callable], ...]
+    potentials: tuple[tuple[str, Callable], ...]
+    has_gravity: bool
+
+    @cached_property
+    def body_groups(self) -> tuple[Bodies, ...]:
+        sizes = [(k.num_coordinates, k.num_velocities) for _, k in self.bodies]
+        starts = np.concatenate([np.zeros((1, 2), int), np.cumsum(sizes, axis=0)])
+        place = {name: k for k, (name, _) in enumerate(self.bodies)}
+        groups = []
+        for kind, members in _grouped(self.bodies, lambda body: body[1]):
+            names = tuple(name for name, _ in members)
+            first = starts[[place[name] for name in names]]
+            q = first[:, :1] + np.arange(kind.num_coordinates)
+            v = first[:, 1:] + np.arange(kind.num_velocities)
+            groups.append(Bodies(kind, names, q, v))
+        return tuple(groups)
+
+    @cached_property
+    def numbers_of_bodies(self) -> dict[str, int]:
+        """The row of each body in a table of frames."""
+        return numbers_of(self.bodies)
+
+    @cached_property
+    def turning(self) -> np.ndarray:
+        """Which rows of a table of frames turn."""
+        flags = [[group.kind.turns] * len(group.names) for group in self.body_groups]
+        return np.array([False, *sum(flags, [])])
+
+    @cached_property
+    def joint_groups(self) -> tuple[Links, ...]:
+        return _links(self.joints)
+
+    @cached_property
+    def force_groups(self) -> tuple[Links, ...]:
+        return _links(self.forces)
+
+    @cached_property
+    def places(self) -> dict[str, dict[str, tuple[int, int]]]:
+        """Group and row of every part, section by section."""
+        sections = dict(
+            bodies=self.body_groups, joints=self.joint_groups, forces=self.force_groups
+        )
+        return {
+            section: {
+                name: (number, row)
+                for number, group in enumerate(groups)
+                for row, name in enumerate(group.names)
+            }
+            for section, groups in sections.items()
+        }
+
+    @property
+    def num_coordinates(self) -> int:
+        return sum(kind.num_coordinates for _, kind in self.bodies)
+
+    @property
+    def num_velocities(self) -> int:
+        return sum(kind.num_velocities for _, kind in self.bodies)
+
+
+def numbers_of(bodies: Iterable[tuple[str, AbstractKind]]) -> dict[str, int]:
+    """The ground is 0; bodies follow kind by kind."""
+    groups = _grouped(bodies, lambda body: body[1])
+    names = [name for _, members in groups for name, _ in members]
+    return {name: k for k, name in enumerate([GROUND, *names])}
+
+
+def _links(links: tuple[Link, ...]) -> tuple[Links, ...]:
+    return tuple(
+        Links(
+            law,
+            tuple(link.name for link in members),
+            np.array([link.a for link in members]),
+            np.array([link.b for link in members]),
+        )
+        for law, members in _grouped(links, lambda link: link.law)
+    )
+
+
+def _grouped(items: Iterable[Any], key: Callable[[Any], Hashable]) -> list[tuple]:
+    """Items of like keys together, in the order in which the keys appear."""
+    groups: dict[Any, list] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return list(groups.items())

@@ -1,0 +1,57 @@
+"""What users write for a number, checked: NumPy where it is known, JAX where traced."""
+
+from types import ModuleType
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._tracing import is_known
+
+
+def module_of(*values: Any) -> ModuleType:
+    """`numpy` for known values: nothing is compiled to make a part; else `jax.numpy`."""
+    return np if is_known(values) else jnp
+
+
+def number(part: str, role: str, value: Any, *shapes: tuple[int, ...]) -> Any:
+    """`value` as an array of floats of one of the shapes."""
+    known = is_known(value)
+    try:
+        array = np.asarray(value, float) if known else jnp.asarray(value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{role} of {part} must be of numbers, got {value!r}.") from None
+    if array.shape not in shapes:
+        wanted = " or ".join(str(shape) if shape else "a scalar" for shape in shapes)
+        raise ValueError(f"{role} of {part} must be {wanted}, got shape {array.shape}.")
+    if known and not np.all(np.isfinite(array)):
+        raise ValueError(f"{role} of {part} is not finite: {value}.")
+    return array
+
+
+def positive(part: str, role: str, value: Any) -> Any:
+    array = number(part, role, value, ())
+    if is_known(array) and not array > 0:
+        raise ValueError(f"{role} of {part} must be positive, got {value}.")
+    return array
+
+
+def direction(part: str, role: str, value: Any, dimension: int) -> Any:
+    """A unit vector along `value`."""
+    array = number(part, role, value, (dimension,))
+    xp = module_of(array)
+    length = xp.sqrt(xp.sum(array**2))
+    if is_known(array) and not length > 0:
+        raise ValueError(f"{role} of {part} must not be zero.")
+    return array / length
+
+
+def basis(axis: Any) -> Any:
+    """Unit vectors along the rows, right-handed: along the axis the last one in space,
+    the first one in the plane."""
+    xp = module_of(axis)
+    if axis.shape == (2,):
+        return xp.stack([axis, axis[::-1] * np.array([-1.0, 1.0])])
+    aside = xp.cross(axis, xp.eye(3)[xp.argmin(xp.abs(axis))])
+    x = aside / xp.sqrt(xp.sum(aside**2))
+    return xp.stack([x, xp.cross(axis, x), axis])

@@ -1,0 +1,87 @@
+"""The numbers of a scene, found by name and kept kind by kind."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ._frames import Numbers
+from ._layout import Layout
+
+
+class Parameters(eqx.Module):
+    """All numbers of a scene: what its system takes as `args`.
+
+    `args["bodies"]["crank"]["mass"]`, `args["joints"]["pin"]["point_b"]`,
+    `args["forces"]["spring"]["stiffness"]`, `args["gravity"]`, and what you gave to the
+    scene as `args` under your own names. Read so, and changed with `set`: the leaves of
+    this tree are tables, one row for each part of a kind, so that a hundred rods make the
+    same program as one. Gradients with respect to it are read by name too.
+    """
+
+    tables: dict[str, tuple[Numbers, ...]]
+    own: dict[str, Any]
+    layout: Layout = eqx.field(static=True)
+
+    def __getitem__(self, key: str) -> Any:
+        return _Section(self, key) if key in self.tables else self.own[key]
+
+    def set(self, name: str | None = None, /, **numbers: Any) -> "Parameters":
+        """With other numbers of a part, or without a name others of your own.
+
+        `args.set("crank", mass=2.0)`, `args.set(gravity=[0.0, -1.62])`. Lengths and
+        points change the joints: make a new start with `scene.start(args)`.
+
+        **Raises:** `ValueError` for a part or number that does not exist.
+        """
+        if name is None:
+            own = {key: _like(self.own, key, value) for key, value in numbers.items()}
+            return Parameters(self.tables, self.own | own, self.layout)
+        places = self.layout.places
+        section = next((key for key, names in places.items() if name in names), None)
+        if section is None:
+            raise ValueError(f"There is no part '{name}' with numbers of its own.")
+        group, row = places[section][name]
+        table = dict(self.tables[section][group])
+        for key, value in numbers.items():
+            if key not in table:
+                raise ValueError(f"'{name}' has no `{key}`; it has {sorted(table)}.")
+            table[key] = table[key].at[row].set(_like(self[section][name], key, value))
+        groups = list(self.tables[section])
+        groups[group] = table
+        return Parameters(self.tables | {section: tuple(groups)}, self.own, self.layout)
+
+
+def _like(old: Mapping[str, Any], key: str, value: Any) -> Any:
+    """A new value in the place of an old one, of its type and shape."""
+    if key not in old:
+        raise ValueError(f"There is no `{key}`; there are {sorted(old)}.")
+    if not eqx.is_array(old[key]):
+        return value
+    new = jnp.asarray(value, old[key].dtype)
+    if new.shape != old[key].shape:
+        raise ValueError(f"`{key}` has shape {old[key].shape}, got {new.shape}.")
+    return new
+
+
+class _Section(Mapping):
+    """The parts of one section by name."""
+
+    def __init__(self, parameters: Parameters, section: str):
+        self._tables = parameters.tables[section]
+        self._places = parameters.layout.places[section]
+
+    def __getitem__(self, name: str) -> Numbers:
+        group, row = self._places[name]
+        return jax.tree.map(lambda table: table[row], self._tables[group])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._places)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __repr__(self) -> str:
+        return repr(dict(self))

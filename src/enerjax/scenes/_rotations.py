@@ -1,0 +1,74 @@
+"""Rotations and inertias as users write them."""
+
+from typing import Any
+
+import numpy as np
+
+from .._tracing import is_known
+from ._numbers import module_of, number
+
+
+def symmetric_inertia(name: str, inertia: Any, may_be_flat: bool) -> Any:
+    """The matrix `(3, 3)` of principal moments or of a matrix, if a body can have it."""
+    matrix = number(f"'{name}'", "`inertia`", inertia, (3,), (3, 3))
+    if matrix.ndim == 1:
+        matrix = module_of(matrix).diag(matrix)
+    if is_known(matrix):
+        _check_inertia(name, matrix, may_be_flat)
+    return matrix
+
+
+def _check_inertia(name: str, matrix: np.ndarray, may_be_flat: bool) -> None:
+    size = np.max(np.abs(matrix))
+    if np.max(np.abs(matrix - matrix.T)) > 1e-9 * size:
+        raise ValueError(f"`inertia` of '{name}' is not symmetric: {matrix.tolist()}.")
+    moments = np.linalg.eigvalsh(matrix)
+    smallest, thinnest = moments[0], moments.sum() / 2 - moments[-1]
+    if smallest <= 1e-9 * size or thinnest < -1e-9 * size:
+        raise ValueError(
+            f"No body has the `inertia` of '{name}', principal moments {moments.tolist()}: "
+            "all must be positive, and none larger than the sum of the other two."
+        )
+    if thinnest <= 1e-9 * size and not may_be_flat:
+        raise ValueError(
+            f"'{name}' is flat: principal moments {moments.tolist()}, the largest the sum "
+            "of the others. An axis without extent has no inertia of its own, which a "
+            "`RigidBody` needs: give it a thickness, or make it a `QuaternionBody`."
+        )
+
+
+def rotation_matrix(name: str, rotation: Any) -> Any:
+    """The rotation matrix of a quaternion or matrix, body axes along its columns."""
+    if rotation is None:
+        return np.eye(3)
+    given = number(f"'{name}'", "`rotation`", rotation, (4,), (3, 3))
+    if is_known(given):
+        product = given @ given - 1 if given.ndim == 1 else given @ given.T - np.eye(3)
+        mirrored = given.ndim == 2 and np.linalg.det(given) < 0
+        if np.max(np.abs(product)) > 1e-6 or mirrored:
+            raise ValueError(
+                f"`rotation` of '{name}' is no rotation: give a unit quaternion (scalar "
+                "first) or an orthogonal matrix of determinant 1, got "
+                f"{given.tolist()}."
+            )
+    return given if given.ndim == 2 else _matrix_of(given)
+
+
+def _matrix_of(p: Any) -> Any:
+    xp = module_of(p)
+    a, b, c, d = p / xp.sqrt(xp.sum(p**2))
+    skew = xp.stack([0 * a, -d, c, d, 0 * a, -b, -c, b, 0 * a]).reshape(3, 3)
+    return np.eye(3) + 2 * a * skew + 2 * skew @ skew
+
+
+def quaternion_of(matrix: Any) -> Any:
+    """The unit quaternion of a rotation matrix, scalar first."""
+    xp = module_of(matrix)
+    m, trace = matrix, xp.trace(matrix)
+    turn = xp.stack([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
+    # Four times p p^T: its largest column is the one without cancellation.
+    first = xp.concatenate([(1 + trace)[None], turn])
+    others = xp.concatenate([turn[:, None], m + m.T + (1 - trace) * np.eye(3)], axis=1)
+    products = xp.concatenate([first[None], others])
+    k = xp.argmax(xp.diagonal(products))
+    return products[k] / (2 * xp.sqrt(products[k, k]))

@@ -1,0 +1,101 @@
+"""The two bodies of a joint or force in the start pose: what was not given follows."""
+
+from typing import Any, NamedTuple
+
+from .._tracing import is_known
+from ._frames import Frame, Numbers
+from ._numbers import basis, direction, module_of, number
+
+
+class Ends(NamedTuple):
+    """The bodies that a part connects, in the start pose.
+
+    - `part`, `bodies`: names, for messages.
+    - `frames`: with all fields that the plane or space has.
+    - `turns`: whether each has an orientation; the ground counts as one that has.
+    """
+
+    part: str
+    bodies: tuple[str, str]
+    frames: tuple[Frame, Frame]
+    turns: tuple[bool, bool]
+
+    @property
+    def dimension(self) -> int:
+        return self.frames[0].origin.size
+
+    def points(self, point_a: Any, point_b: Any) -> Numbers:
+        """Points in the body frames; where one is missing, where the other one is."""
+        a, b = self._point(0, point_a), self._point(1, point_b)
+        if a is None and b is not None:
+            a = self._seen(0, 1, b)
+        elif b is None and a is not None:
+            b = self._seen(1, 0, a)
+        return self.origins(a, b)
+
+    def origins(self, point_a: Any, point_b: Any) -> Numbers:
+        """Points in the body frames; where one is missing, the origin."""
+        a, b = self._point(0, point_a), self._point(1, point_b)
+        origin = 0 * self.frames[0].origin
+        return dict(point_a=origin if a is None else a, point_b=origin if b is None else b)
+
+    def axes(self, axis_a: Any, axis_b: Any = None) -> Numbers:
+        """The axes of the joint in both bodies, as rows; see `basis`."""
+        for body, turns in zip(self.bodies, self.turns, strict=True):
+            if not turns:
+                raise ValueError(
+                    f"{self.part} needs the orientation of '{body}', and a point mass has "
+                    "none."
+                )
+        a, b = self.frames
+        of_a = basis(self._axis("`axis`", axis_a))
+        if axis_b is None:
+            return dict(frame_a=of_a, frame_b=of_a @ a.axes @ b.axes.T)
+        return dict(frame_a=of_a, frame_b=basis(self._axis("`axis_b`", axis_b)))
+
+    def _axis(self, role: str, axis: Any) -> Any:
+        if axis is None:
+            raise ValueError(f"{self.part} needs {role}, a vector of {self.dimension}.")
+        return direction(self.part, role, axis, self.dimension)
+
+    def length(self, numbers: Numbers) -> Any:
+        """The distance of two points at the start."""
+        ends = zip(self.frames, ("point_a", "point_b"), strict=True)
+        a, b = (frame.origin + numbers[key] @ frame.axes for frame, key in ends)
+        xp = module_of(a, b)
+        return xp.sqrt(xp.sum((b - a) ** 2))
+
+    def turn(self) -> Any:
+        """The difference of the angles at the start."""
+        return self.frames[1].angle - self.frames[0].angle
+
+    def refuse_axes(self, *axes: Any) -> None:
+        if any(axis is not None for axis in axes):
+            raise ValueError(f"{self.part} is in the plane, where it has no axis to give.")
+
+    def only_in_space(self, what: str) -> None:
+        if self.dimension == 2:
+            raise ValueError(f"{what} ({self.part}) is for bodies in space.")
+
+    def only_in_plane(self, what: str) -> None:
+        if self.dimension == 3:
+            raise ValueError(f"{what} ({self.part}).")
+
+    def _point(self, k: int, point: Any) -> Any:
+        if point is None:
+            return None
+        role = ("`point_a`", "`point_b`")[k]
+        point = number(self.part, role, point, (self.dimension,))
+        if not self.turns[k] and not (is_known(point) and not point.any()):
+            raise ValueError(
+                f"{role} of {self.part} is off '{self.bodies[k]}', which is a point mass: "
+                "leave it out."
+            )
+        return point
+
+    def _seen(self, k: int, other: int, point: Any) -> Any:
+        """In one body, where a point of the other one is at the start."""
+        if not self.turns[k]:
+            return None
+        there, here = self.frames[other], self.frames[k]
+        return here.axes @ (there.origin + point @ there.axes - here.origin)

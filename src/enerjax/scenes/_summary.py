@@ -1,0 +1,35 @@
+"""A scene in words."""
+
+from ._layout import Layout
+
+
+def summary(
+    layout: Layout,
+    kinds: dict[str, str],
+    ends: dict[str, tuple[str, str]],
+    rows: dict[str, slice],
+) -> str:
+    """Bodies, joints and forces with what they are and what they count for."""
+    bodies, joined = dict(layout.bodies), {x for pair in ends.values() for x in pair}
+    internal = sum(kind.num_internal for kind in bodies.values())
+    held = sum(place.stop - place.start for place in rows.values())
+    world = "the plane" if layout.dimension == 2 else "space"
+    freedom = layout.num_velocities - internal - held
+    lines = [
+        f"A scene in {world}: {layout.num_coordinates} coordinates, {held} constraints of "
+        f"joints, {freedom} degree{'' if freedom == 1 else 's'} of freedom."
+    ]
+    width = max(len(name) for name in kinds)
+    line = lambda name, text: f"  {name:{width}}  {kinds[name]:14}  {text}".rstrip()
+    first = 0
+    for name, kind in bodies.items():
+        last = first + kind.num_coordinates
+        free = "" if name in joined else ", connected to nothing"
+        lines.append(line(name, f"q[{first}:{last}]{free}"))
+        first = last
+    for name, place in rows.items():
+        between = " - ".join(ends[name]) + ", " if name in ends else ""
+        lines.append(line(name, f"{between}constraint[{place.start}:{place.stop}]"))
+    others = [name for name in kinds if name not in bodies and name not in rows]
+    lines += [line(name, " - ".join(ends.get(name, ()))) for name in others]
+    return "\n".join(lines)

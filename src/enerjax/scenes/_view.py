@@ -1,0 +1,98 @@
+"""Where the bodies of a scene are, for given coordinates."""
+
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._types import Coordinates, Scalar, Vector
+from ._frames import Frame, Point
+from ._layout import Layout
+
+
+def rows(x: Array, index: np.ndarray) -> Array:
+    """`x[index]`, without a look-up where the entries follow each other."""
+    first = index.flat[0]
+    if np.array_equal(index.ravel(), np.arange(first, first + index.size)):
+        return x[first : first + index.size].reshape(index.shape + x.shape[1:])
+    return x[index]
+
+
+class View:
+    """A scene at its coordinates `q`; what is not asked for is not computed.
+
+    `position(body, point)`, `direction(body, axis)` and `angle(body)` are for potentials
+    and constraints of your own; `q` are the coordinates of all bodies.
+    """
+
+    def __init__(self, layout: Layout, q: Coordinates):
+        self.layout = layout
+        self.q = q
+
+    @cached_property
+    def origins(self) -> Float[Array, "bodies d"]:
+        ground = jnp.zeros((1, self.layout.dimension), self.q.dtype)
+        return self._table("origin", ground)
+
+    @cached_property
+    def axes(self) -> Float[Array, "bodies d d"]:
+        return self._table("axes", jnp.eye(self.layout.dimension, dtype=self.q.dtype)[None])
+
+    @cached_property
+    def angles(self) -> Float[Array, " bodies"]:
+        return self._table("angle", jnp.zeros((1,), self.q.dtype))
+
+    def _table(self, field: str, ground: Array) -> Array:
+        parts = [ground]
+        for group in self.layout.body_groups:
+            parts.append(jax.vmap(getattr(group.kind, field))(rows(self.q, group.q)))
+        return jnp.concatenate(parts)
+
+    def frames(self, bodies: np.ndarray, reads: tuple[str, ...]) -> Frame:
+        """The frames of some bodies, stacked, with the fields that are read."""
+        fields = {}
+        if "origin" in reads:
+            fields["origin"] = self._origins_of(bodies)
+        if "axes" in reads and self.layout.turning[bodies].any():
+            fields["axes"] = rows(self.axes, bodies)
+        if "angle" in reads:
+            fields["angle"] = rows(self.angles, bodies)
+        return Frame(**fields)
+
+    def _origins_of(self, bodies: np.ndarray) -> Array:
+        if not bodies.any():  # all on the ground
+            return jnp.zeros((bodies.size, self.layout.dimension), self.q.dtype)
+        return rows(self.origins, bodies)
+
+    def frame(self, body: str) -> Frame:
+        """The frame of one body, with all its fields."""
+        k = self._number(body)
+        return Frame(self.origins[k], self.axes[k], self.angles[k])
+
+    def _number(self, body: str) -> int:
+        try:
+            return self.layout.numbers_of_bodies[body]
+        except KeyError:
+            raise ValueError(
+                f"There is no body '{body}'; there are {[*self.layout.numbers_of_bodies]}."
+            ) from None
+
+    def position(self, body: str, point: Vector | None = None) -> Point:
+        """A point of a body in space; its mass centre if none is given."""
+        k = self._number(body)
+        if point is None:
+            return self.origins[k]
+        axes = self.axes[k] if self.layout.turning[k] else None
+        return Frame(self.origins[k], axes).point(jnp.asarray(point, self.q.dtype))
+
+    def direction(self, body: str, axis: Vector) -> Point:
+        """A direction of a body in space."""
+        return Frame(axes=self.axes[self._number(body)]).direction(
+            jnp.asarray(axis, self.q.dtype)
+        )
+
+    def angle(self, body: str) -> Scalar:
+        """The angle of a body in the plane."""
+        return self.angles[self._number(body)]

@@ -1,0 +1,133 @@
+"""Forces with a potential. Points are told as for joints, in the frames of the bodies."""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Array
+
+from .._types import Args, Real, Vector
+from ._frames import GROUND, Numbers
+from ._laws import AbstractLaw, PlanarTorsion, PlanarTwist, Pull, SpringEnergy, Torsion
+from ._numbers import number
+from ._start import Ends
+
+
+class AbstractForce(eqx.Module):
+    """A force between two bodies: `a` and `b` are names, or `"ground"`."""
+
+    name: eqx.AbstractVar[str]
+    a: eqx.AbstractVar[str]
+    b: eqx.AbstractVar[str]
+
+    @abc.abstractmethod
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        """The law of its energy and its numbers, from the start pose of its bodies."""
+
+
+class Spring(AbstractForce):
+    """A linear spring between two points, `stiffness (r - length)^2 / 2`.
+
+    Points that are not given are the origins of the frames; a `length` that is not given
+    is that of the start. The points must not meet, where the direction is undefined.
+    """
+
+    name: str
+    a: str
+    b: str
+    stiffness: Real
+    length: Real | None = None
+    point_a: Vector | None = None
+    point_b: Vector | None = None
+
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        numbers = ends.origins(self.point_a, self.point_b)
+        length = ends.length(numbers) if self.length is None else self.length
+        return SpringEnergy(), numbers | dict(
+            stiffness=number(ends.part, "`stiffness`", self.stiffness, ()),
+            length=number(ends.part, "`length`", length, ()),
+        )
+
+
+class TorsionSpring(AbstractForce):
+    """A linear spring between the angles of two bodies, `stiffness (turn - angle)^2 / 2`.
+
+    In the plane `turn` is the difference of the angles, over any number of turns, and an
+    `angle` that is not given is that of the start. In space `turn` is counted from the
+    start about `axis`, told in the first body, and `angle` is zero if it is not given;
+    bodies that a revolute joint connects about this axis. The energy jumps at half a turn
+    there: keep away from it.
+    """
+
+    name: str
+    a: str
+    b: str
+    stiffness: Real
+    angle: Real | None = None
+    axis: Vector | None = None
+
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        numbers = dict(stiffness=number(ends.part, "`stiffness`", self.stiffness, ()))
+        if ends.dimension == 2:
+            ends.refuse_axes(self.axis)
+            law, start = PlanarTorsion(), ends.turn()
+        else:
+            law, start = Torsion(), 0.0
+            numbers |= ends.axes(self.axis)
+        angle = start if self.angle is None else self.angle
+        return law, numbers | dict(angle=number(ends.part, "`angle`", angle, ()))
+
+
+class ConstantForce(AbstractForce):
+    """A force on a point of a `body` that keeps its direction in space.
+
+    `force` has two or three entries; `point` is the mass centre if it is not given.
+    """
+
+    name: str
+    a: str
+    b: str
+    force: Vector
+    point: Vector | None
+
+    def __init__(self, name: str, body: str, force: Vector, point: Vector | None = None):
+        self.name, self.a, self.b = name, GROUND, body
+        self.force, self.point = force, point
+
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        force = number(ends.part, "`force`", self.force, (ends.dimension,))
+        point = ends.origins(None, self.point)["point_b"]
+        return Pull(), dict(force=force, point_b=point)
+
+
+class ConstantTorque(AbstractForce):
+    """A constant torque on a `body` in the plane, counterclockwise.
+
+    Its opposite acts on `reacting`.
+    """
+
+    name: str
+    a: str
+    b: str
+    torque: Real
+
+    def __init__(self, name: str, body: str, torque: Real, reacting: str = GROUND):
+        self.name, self.a, self.b = name, reacting, body
+        self.torque = torque
+
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        ends.only_in_plane("A constant torque has a potential only in the plane")
+        torque = number(ends.part, "`torque`", self.torque, ())
+        return PlanarTwist(), dict(torque=torque)
+
+
+class Potential(eqx.Module):
+    """A potential of your own: `function(view, args)`, a scalar (energy).
+
+    `view` tells where the bodies are: `view.position(body, point)`,
+    `view.direction(body, axis)`, `view.angle(body)` and `view.q`, the coordinates.
+    """
+
+    name: str
+    function: Callable[[Any, Args], Array]

@@ -1,0 +1,235 @@
+"""Joints: what constrains two bodies, or a body and the `"ground"`.
+
+Points and axes are told in the frames of their bodies; those of the ground are in space. Of
+two points, one that is not given is where the other one is in the start pose; if neither is
+given they are the origins of the frames. Axes that are not given for the second body follow
+from the start pose too. So `Revolute("pin", "ground", "crank", [0.3, 0])` is a pin through
+the crank, where the crank starts.
+
+`args["joints"][name]` holds `point_a`, `point_b` and, for joints with axes, the axes of the
+joint in either body, `frame_a` and `frame_b`, as rows (the axis comes last in space, first
+in the plane).
+"""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Array
+
+from .._types import Args, Real, Vector
+from ._frames import Numbers
+from ._laws import AbstractLaw, Alignment, Curve, Length
+from ._numbers import module_of, positive
+from ._start import Ends
+
+
+class AbstractJoint(eqx.Module):
+    """A joint of a scene: `a` and `b` are names of bodies, or `"ground"`."""
+
+    name: eqx.AbstractVar[str]
+    a: eqx.AbstractVar[str]
+    b: eqx.AbstractVar[str]
+
+    @abc.abstractmethod
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        """Its law and its numbers, from the start pose of its bodies."""
+
+
+class Spherical(AbstractJoint):
+    """Holds two points together: a ball joint, three constraints in space.
+
+    Their multipliers are minus the force on the second body.
+    """
+
+    name: str
+    a: str
+    b: str
+    point_a: Vector | None = None
+    point_b: Vector | None = None
+
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        return Alignment(None), ends.points(self.point_a, self.point_b)
+
+
+class Revolute(AbstractJoint):
+    """Holds two points together, and in space an axis: a pin or hinge.
+
+    Two constraints in the plane, where there is no `axis` to give, five in space. `axis`
+    is told in the first body, `axis_b` in the second.
+    """
+
+    name: str
+    a: str
+    b: str
+    point_a: Vector | None = None
+    point_b: Vector | None = None
+    axis: Vector | None = None
+    axis_b: Vector | None = None
+
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        points = ends.points(self.point_a, self.point_b)
+        if ends.dimension == 2:
+            ends.refuse_axes(self.axis, self.axis_b)
+            return Alignment(None), points
+        law = Alignment(None, ((2, 0), (2, 1)))
+        return law, points | ends.axes(self.axis, self.axis_b)
+
+
+class Universal(AbstractJoint):
+    """Holds two points together and two axes perpendicular: a Cardan joint, in space.
+
+    Four constraints. `axis` is fixed in the first body, `axis_b` in the second.
+    """
+
+    name: str
+    a: str
+    b: str
+    point_a: Vector | None = None
+    point_b: Vector | None = None
+    axis: Vector | None = None
+    axis_b: Vector | None = None
+
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        ends.only_in_space("A universal joint")
+        axes = ends.axes(self.axis, () if self.axis_b is None else self.axis_b)
+        points = ends.points(self.point_a, self.point_b)
+        return Alignment(None, ((2, 2),)), points | axes
+
+
+class Prismatic(AbstractJoint):
+    """Lets a body slide along an axis of the first body, and turn about none.
+
+    Two constraints in the plane, five in space.
+    """
+
+    name: str
+    a: str
+    b: str
+    point_a: Vector | None = None
+    point_b: Vector | None = None
+    axis: Vector | None = None
+
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        numbers = ends.points(self.point_a, self.point_b) | ends.axes(self.axis)
+        if ends.dimension == 2:
+            return Alignment((1,), ((0, 1),)), numbers
+        return Alignment((0, 1), ((0, 1), (1, 2), (2, 0))), numbers
+
+
+class Cylindrical(AbstractJoint):
+    """Lets a body slide along an axis of the first body and turn about it, in space.
+
+    Four constraints.
+    """
+
+    name: str
+    a: str
+    b: str
+    point_a: Vector | None = None
+    point_b: Vector | None = None
+    axis: Vector | None = None
+    axis_b: Vector | None = None
+
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        ends.only_in_space("A cylindrical joint")
+        numbers = ends.points(self.point_a, self.point_b)
+        law = Alignment((0, 1), ((2, 0), (2, 1)))
+        return law, numbers | ends.axes(self.axis, self.axis_b)
+
+
+class Planar(AbstractJoint):
+    """Lets a body slide and turn in the plane of the first body that `axis` is normal to.
+
+    Three constraints, in space.
+    """
+
+    name: str
+    a: str
+    b: str
+    point_a: Vector | None = None
+    point_b: Vector | None = None
+    axis: Vector | None = None
+    axis_b: Vector | None = None
+
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        ends.only_in_space("A planar joint")
+        numbers = ends.points(self.point_a, self.point_b)
+        law = Alignment((2,), ((2, 0), (2, 1)))
+        return law, numbers | ends.axes(self.axis, self.axis_b)
+
+
+class Fixed(AbstractJoint):
+    """Holds two bodies in the relative pose of the start.
+
+    Three constraints in the plane, six in space.
+    """
+
+    name: str
+    a: str
+    b: str
+    point_a: Vector | None = None
+    point_b: Vector | None = None
+
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        axis = [1.0, 0.0, 0.0][: ends.dimension]
+        numbers = ends.points(self.point_a, self.point_b) | ends.axes(axis)
+        square = ((0, 1),) if ends.dimension == 2 else ((0, 1), (1, 2), (2, 0))
+        return Alignment(None, square), numbers
+
+
+class Distance(AbstractJoint):
+    """Holds two points at a distance: a rod without mass. One constraint.
+
+    Points that are not given are the origins of the frames, a `length` (positive) that is
+    not given is that of the start.
+    """
+
+    name: str
+    a: str
+    b: str
+    point_a: Vector | None = None
+    point_b: Vector | None = None
+    length: Real | None = None
+
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        numbers = ends.origins(self.point_a, self.point_b)
+        length = ends.length(numbers) if self.length is None else self.length
+        return Length(), numbers | dict(length=positive(ends.part, "`length`", length))
+
+
+class OnCurve(AbstractJoint):
+    """Holds a point of the second body on a curve or surface in the first.
+
+    `curve(x, numbers)` is a vector of smooth functions of a point `x` in the frame of the
+    first body, shape `(2,)` or `(3,)`, that vanish on the curve: one entry for a curve in
+    the plane or a surface in space, two for a curve in space. `numbers` is the dictionary
+    of floats given here, found again in `args["joints"][name]`.
+    """
+
+    name: str
+    a: str
+    b: str
+    curve: Callable[[Array, Numbers], Array]
+    numbers: Numbers = eqx.field(default_factory=dict)
+    point_b: Vector | None = None
+
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        own = {
+            key: module_of(value).asarray(value) * 1.0
+            for key, value in self.numbers.items()
+        }
+        point = ends.origins(None, self.point_b)["point_b"]
+        return Curve(self.curve), own | dict(point_b=point)
+
+
+class Constraint(eqx.Module):
+    """A constraint of your own: `function(view, args)`, a vector that vanishes.
+
+    `view` tells where the bodies are: `view.position(body, point)`,
+    `view.direction(body, axis)`, `view.angle(body)` and `view.q`, the coordinates.
+    """
+
+    name: str
+    function: Callable[[Any, Args], Array]
