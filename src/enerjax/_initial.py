@@ -90,12 +90,14 @@ def consistent_start(
         lambda: f"Residual of the constraints: {start.constraint_before}.",
     )
     num_constraints = start.multipliers.size
+    if system.redundant:
+        return start
     return _raise_unless(
         rank == num_constraints,
         start,
         "The constraints do not determine their multipliers at the start: some repeat "
         "each other, or do not depend on `q` there (a square of a distance?). Leave out "
-        "those that follow from the others.",
+        "those that follow from the others, or declare `System(..., redundant=True)`.",
         lambda: f"Their Jacobian has rank {rank}, of {num_constraints} rows.",
     )
 
@@ -186,7 +188,9 @@ def _project_position(model: AbstractModel, state: State) -> tuple[Coordinates, 
     inputs = (model, metric, guess, t, size)
     zero = (jnp.zeros_like(guess), jnp.zeros_like(scales.constraint))
     tolerance = 1e2 * jnp.finfo(guess.dtype).eps
-    root = find_root(conditions, Newton(), zero, inputs, max_iterations=50)
+    fill = model.fill(scales.constraint.size, guess.dtype)
+    fill = None if fill is None else (zero[0], fill)
+    root = find_root(conditions, Newton(), zero, inputs, max_iterations=50, fill=fill)
     x, found = root.value, root.found
     # Constraints that are met are not far; whether they are independent is told apart.
     met = largest(conditions(zero, inputs)[1]) <= tolerance
@@ -214,7 +218,8 @@ def _linear(model: AbstractModel, metric: Symmetric, state: State) -> Flag:
             force = metric @ shift + transpose(mu)[0]
             return jnp.concatenate([force / scales.coordinate, change / scales.constraint])
 
-        x = affine_root(conditions, jnp.zeros((q.size + residual.size,), q.dtype))
+        like = jnp.zeros((q.size + residual.size,), q.dtype)
+        x = affine_root(conditions, like, model.fill_behind(q))
         return x[: q.size] / scales.coordinate
 
     first = correction(constraint(q))
@@ -235,7 +240,8 @@ def _project_velocity(model: AbstractModel, state: State) -> Velocities:
         unit = model.scales.constraint[: rate.size]
         change = lambda mu: mobility @ transpose(mu / unit)[0]
         remaining = lambda mu: (rate - jax.jvp(rates, (v,), (change(mu),))[1]) / unit
-        return v - change(affine_root(remaining, rate)), None
+        fill = model.fill(rate.size, v.dtype)
+        return v - change(affine_root(remaining, rate, fill)), None
 
     # Exact at once where the energy is a quadratic form of the momenta; else Newton.
     corrections = 8 if isinstance(model.system, HamiltonianSystem) else 1

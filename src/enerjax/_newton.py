@@ -57,12 +57,15 @@ class Start(eqx.Module):
     - `guess`, `second_guess`: first values of the unknowns.
     - `factors`: of the Jacobian of the solve before, where it is kept.
     - `skip`: return the guess without an iteration.
+    - `fill`: for each unknown, what is added to the diagonal of a Jacobian that may be
+      singular; see `find_root`.
     """
 
     guess: PyTree[Array]
     second_guess: PyTree[Array]
     factors: AbstractFactors | None
     skip: Flag
+    fill: PyTree[Array] | None
 
 
 class _Iterate(eqx.Module):

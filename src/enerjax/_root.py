@@ -50,6 +50,10 @@ def _flattened(fn: Callable, value: PyTree[Array]) -> tuple[Array, Callable, Cal
     return flat, unravel, lambda x, args: ravel_pytree(fn(unravel(x), args))[0]
 
 
+def _flat(fill: PyTree[Array] | None) -> Array | None:
+    return None if fill is None else ravel_pytree(fill)[0]
+
+
 def _search(
     fn: Callable[[PyTree[Array], Any], PyTree[Array]],
     root_finder: RootFinder,
@@ -68,7 +72,8 @@ def _search(
         steps = solution.stats["num_steps"]
         return Root(solution.value, start.factors, steps, found, singular | nonfinite)
     flat, unravel, flat_fn = _flattened(fn, start.guess)
-    residual = linearisable(flat_fn, flat, args, root_finder.linear_solver)
+    given, fill = root_finder.linear_solver, _flat(start.fill)
+    residual = linearisable(flat_fn, flat, args, given, fill)
     last = newton_iterations(residual, root_finder, start, max_iterations)
     keeps = residual.is_dense and start.factors is not None
     factors = last.factors if keeps else start.factors
@@ -98,7 +103,8 @@ def _root_jvp(primals, tangents):
     by_args = lambda moved: flat_fn(flat, eqx.combine(moved, fixed))
     _, rate = jax.jvp(by_args, (moved,), (t_args,))
     given = root_finder.linear_solver if isinstance(root_finder, Newton) else None
-    change = linearisable(flat_fn, flat, args, given).solve(flat, -rate)
+    linear = linearisable(flat_fn, flat, args, given, _flat(start.fill))
+    change = linear.solve(flat, -rate)
     # Nothing but the root itself depends on the arguments: not how it was found.
     still = jax.tree.map(jnp.zeros_like, eqx.filter(root, eqx.is_inexact_array))
     return root, eqx.tree_at(lambda root: root.value, still, unravel(change))
@@ -114,6 +120,7 @@ def find_root(
     second_guess: PyTree[Array] | None = None,
     factors: AbstractFactors | None = None,
     skip: Flag | bool = False,
+    fill: PyTree[Array] | None = None,
 ) -> Root:
     """The root of `fn(y, args)`. Never raises.
 
@@ -121,6 +128,10 @@ def find_root(
     linear solve each; a singular lane of a batch has non-finite derivatives of its own and
     leaves the others alone. `guess`, `factors` (of a solve before) and `second_guess` only
     say where to begin. With `skip`, `Newton` returns the guess without an iteration.
+
+    `fill`, like the guess, is for equations that do not determine some of the unknowns,
+    and do not ask for them either: small numbers that are added to the diagonal of the
+    Jacobian, and make it regular. Such unknowns then stay what they are in the guess.
     """
     flat, _ = ravel_pytree(guess)
     start = Start(
@@ -128,6 +139,7 @@ def find_root(
         guess if second_guess is None else second_guess,
         kept_factors(flat.size, flat.dtype) if factors is None else factors,
         jnp.asarray(skip),
+        fill,
     )
     start = jax.lax.stop_gradient(start)
     # What is closed over becomes an input: functions in `args` may hold traced numbers.

@@ -4,16 +4,18 @@ Here the physics scales what Newton sees: rates by the inertia, multipliers by t
 gradients of their constraints, and everything by an energy of the step.
 """
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from ._linear import AbstractFactors, kept_factors
-from ._model import AbstractModel
+from ._model import AbstractModel, Increment
 from ._newton import max_norm
 from ._results import first_failure, first_of, from_root_finder, RESULTS
 from ._root import find_root, RootFinder
@@ -141,18 +143,33 @@ def _attempt(
     choose = lambda x, y: jnp.where(memory.is_smooth, x, y)
     added = jax.tree.map(choose, smooth, last)
     guess = jax.tree.map(lambda x0, x, s: (x0 + x) / s, flight, added, unknown_scale)
-    root = find_root(
+    find = functools.partial(
+        find_root,
         scaled,
         root_finder,
-        guess,
-        inputs,
+        args=inputs,
         max_iterations=MAX_ITERATIONS,
         # What the last steps suggest can lie beyond a fold of the step equations; the
         # flight without force starts on the near side.
         second_guess=jax.tree.map(jnp.divide, flight, unknown_scale),
-        factors=memory.factors,
-        skip=skip,
+        fill=_fill(model, guess),
     )
+    root = find(guess=guess, factors=memory.factors, skip=skip)
+    if model.system.redundant:
+        # Again, from where constraints that repeat each other agree, and without forces:
+        # what is left open of these by the equations stays zero.
+        first = root
+        guess = _map_multipliers(jnp.zeros_like, root.value)
+        root = find(guess=guess, factors=root.factors, skip=skip | ~root.found)
+        root = eqx.tree_at(
+            lambda root: (root.iterations, root.found, root.broken),
+            root,
+            (
+                root.iterations + first.iterations,
+                root.found & first.found,
+                root.broken | first.broken,
+            ),
+        )
     z = jax.tree.map(jnp.multiply, root.value, unknown_scale)
     end = scheme.finish(z, problem)
     # What the scheme itself can tell of a failed iterate says more than that it failed.
@@ -169,6 +186,23 @@ def _attempt(
         root.factors,
     )
     return end, root.iterations, result, memory
+
+
+def _map_multipliers(fn: Callable[[Array], Array], z: PyTree[Any]) -> PyTree[Any]:
+    """`fn` of the multipliers among unknowns."""
+    parts = lambda x: (x.impulse, x.velocity_impulse)
+    change = lambda x: (
+        eqx.tree_at(parts, x, replace_fn=fn) if isinstance(x, Increment) else x
+    )
+    return jax.tree.map(change, z, is_leaf=lambda x: isinstance(x, Increment))
+
+
+def _fill(model: AbstractModel, z: PyTree[Any]) -> PyTree[Any] | None:
+    """What makes the step equations regular where constraints repeat each other."""
+    if not model.system.redundant:
+        return None
+    zero = jax.tree.map(jnp.zeros_like, z)
+    return _map_multipliers(lambda x: jnp.asarray(model.fill(x.size, x.dtype)), zero)
 
 
 def _free_flight(

@@ -41,6 +41,8 @@ class Linearisable(eqx.Module):
 
     value: Callable[[Float[Array, " n"]], Float[Array, " n"]]
     form: Full | Band | Scattered
+    # Added to the diagonal of a Jacobian that may be singular.
+    fill: Float[Array, " n"] | None
 
     @property
     def is_dense(self) -> bool:
@@ -49,7 +51,10 @@ class Linearisable(eqx.Module):
 
     def jacobian(self, x: Float[Array, " n"]) -> Array:
         """The Jacobian, in the form that `first_factors` are renewed with."""
-        return self.form.evaluate(self.value, x)
+        fill = self.fill
+        if fill is None:
+            return self.form.evaluate(self.value, x)
+        return self.form.evaluate(lambda x: self.value(x) + fill * x, x)
 
     def first_factors(
         self, kept: AbstractFactors | None, x: Float[Array, " n"]
@@ -60,14 +65,31 @@ class Linearisable(eqx.Module):
         return self.form.empty(x.size, x.dtype)
 
     def solve(self, x: Float[Array, " n"], right: Float[Array, " n"]) -> Array:
-        """`J(x)^-1 right`, differentiable in all there is, and transposable in `right`."""
+        """`J(x)^-1 right`, differentiable in all there is, and transposable in `right`.
+
+        Of a singular Jacobian with a `fill` the solution without part in its null space.
+        """
         matrix = self.jacobian(x)
+        if self.fill is None:
+            return self._solve(x, matrix, right)
+        # What the fill has changed is taken back, but for its square.
+        first = self._solve(x, matrix, right)
+        return first + self._solve(x, matrix, self.fill * first)
+
+    def _solve(
+        self, x: Float[Array, " n"], matrix: Array, right: Float[Array, " n"]
+    ) -> Array:
         if self.is_dense:
             return solve(matrix, right)
         factors = self.form.empty(x.size, x.dtype).renewed(matrix)
         factors = jax.lax.stop_gradient(factors)
+
+        def product(t: Array) -> Array:
+            image = jax.jvp(self.value, (x,), (t,))[1]
+            return image if self.fill is None else image + self.fill * t
+
         return jax.lax.custom_linear_solve(
-            lambda t: jax.jvp(self.value, (x,), (t,))[1],
+            product,
             right,
             lambda _, right: factors.solve(right),
             lambda _, right: jax.linear_transpose(factors.solve, right)(right)[0],
@@ -79,33 +101,41 @@ def linearisable(
     like: Float[Array, " n"],
     args: Any,
     linear_solver: lx.AbstractLinearSolver | KLU | None = None,
+    fill: Float[Array, " n"] | None = None,
 ) -> Linearisable:
     """`fn(x, args)` as a function of `x`; what it depends on must be in `args`.
 
-    Without a `linear_solver` the size and the structure of the Jacobian decide.
+    Without a `linear_solver` the size and the structure of the Jacobian decide. `fill` is
+    added to its diagonal where it may be singular.
     """
     value = plain_products(fn, like, args)
     if isinstance(linear_solver, lx.AbstractLinearSolver):
-        return Linearisable(value, Full(linear_solver))
-    full = Linearisable(value, Full(None))
+        return Linearisable(value, Full(linear_solver), fill)
+    full = Linearisable(value, Full(None), fill)
     if like.size <= LARGE:
         return full
-    pattern = jacobian_pattern(value, like)
+    filled = value if fill is None else lambda x: value(x) + fill * x
+    pattern = jacobian_pattern(filled, like)
     if pattern is None:
         return full
     if isinstance(linear_solver, KLU):
-        return Linearisable(value, Scattered(pattern))
+        return Linearisable(value, Scattered(pattern), fill)
     band = Band(pattern)
-    return Linearisable(value, band) if band.worth_it() else full
+    return Linearisable(value, band, fill) if band.worth_it() else full
 
 
 def affine_root(
-    fn: Callable[[Array], Array], like: Float[Array, " n"]
+    fn: Callable[[Array], Array],
+    like: Float[Array, " n"],
+    fill: Float[Array, " n"] | None = None,
 ) -> Float[Array, " n"]:
-    """Where an affine function vanishes; differentiable in what it closes over."""
+    """Where an affine function vanishes; differentiable in what it closes over.
+
+    With a `fill`, which is added to the diagonal, it need not be regular.
+    """
     at = jnp.zeros_like(like)
-    linear = linearisable(lambda x, _: fn(x), at, None)
-    if linear.is_dense:
+    linear = linearisable(lambda x, _: fn(x), at, None, fill=fill)
+    if linear.is_dense and fill is None:
         return -jnp.linalg.solve(linear.jacobian(at), linear.value(at))
     return -linear.solve(at, linear.value(at))
 

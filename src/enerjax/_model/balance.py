@@ -41,14 +41,16 @@ def accelerations(model: "SeparableModel", state: State) -> tuple[Velocities, Mu
         )
         return jnp.concatenate(rows)
 
-    x = affine_root(conditions, jnp.zeros((v.size + scales.constraint.size,), q.dtype))
+    like = jnp.zeros((v.size + scales.constraint.size,), q.dtype)
+    x = affine_root(conditions, like, model.fill_behind(v))
     return unit * x[: v.size], x[v.size :] / scales.constraint
 
 
 def multipliers(model: "SeparableModel", state: State) -> Multipliers:
     """By the constraints alone where `L = I`: a smaller matrix."""
     inverse_inertia = model.inverse_inertia
-    if not model.has_canonical_rates or not isinstance(inverse_inertia, Array):
+    is_plain = model.has_canonical_rates and isinstance(inverse_inertia, Array)
+    if not is_plain or model.system.redundant:
         return accelerations(model, state)[1]
     rows = jax.jacfwd(model.constraint)(state.q, state.t)
     rows = rows / model.scales.constraint[:, None]

@@ -19,6 +19,7 @@ solved for the velocities by hand, and `CanonicalModel` for any Hamiltonian.
 """
 
 import abc
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -201,6 +202,17 @@ class AbstractModel(eqx.Module):
         assert self.system.force is not None
         assert t is not None
         return self.system.force(q, v, t, self.args)
+
+    def fill(self, count: int, dtype: Any) -> Float[Array, " count"] | None:
+        """What makes equations for `count` scaled multipliers regular, if need be."""
+        if not self.system.redundant:
+            return None
+        return jnp.full((count,), -(float(jnp.finfo(dtype).eps) ** 0.5), dtype)
+
+    def fill_behind(self, x: Array) -> Float[Array, " n"] | None:
+        """The same for equations in `x` and a multiplier for each constraint."""
+        fill = self.fill(self.scales.constraint.size, x.dtype)
+        return None if fill is None else jnp.concatenate([jnp.zeros_like(x), fill])
 
     def energy_scale(self, state: State, h: Scalar) -> Scalar:
         """An energy that a step of length `h` handles; never zero, no derivative.

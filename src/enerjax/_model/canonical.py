@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._discrete import AbstractDerivative
-from .._linear import as_dense
+from .._linear import affine_root, as_dense
 from .._system import AbstractCanonicalSystem, State
 from .._types import (
     Args,
@@ -156,7 +156,9 @@ class CanonicalModel(AbstractModel):
         _, change = jax.jvp(self.joint_rate, (q, p, t), (rate, -slope, lapse_of(t)))
         unit = 1 / self.scales.constraint
         matrix = unit[:, None] * (rates @ jacobian.T) * unit[None, :]
-        multipliers = unit * jnp.linalg.solve(matrix, unit * change)
+        balance = lambda x: unit * change - matrix @ x
+        fill = self.fill(unit.size, unit.dtype)
+        multipliers = unit * affine_root(balance, unit, fill)
         return -slope - multipliers @ jacobian, multipliers
 
     def multipliers(self, state: State) -> Multipliers:

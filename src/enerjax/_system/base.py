@@ -71,6 +71,7 @@ class AbstractSystem(eqx.Module):
     constraint: eqx.AbstractVar[Callable[[Coordinates, Args], Multipliers] | None]
     force: eqx.AbstractVar[Force | None]
     driven: eqx.AbstractVar[Driven | None]
+    redundant: eqx.AbstractVar[bool]
 
     @property
     def is_timed(self) -> bool:

@@ -3,6 +3,7 @@
 import abc
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -41,6 +42,7 @@ class LagrangianSystem(AbstractCanonicalSystem):
     constraint: Callable[[Coordinates, Args], Multipliers] | None = None
     force: Force | None = None
     driven: Driven | None = None
+    redundant: bool = eqx.field(default=False, static=True)
 
     def __check_init__(self):
         check_function("kinetic", "(q, qdot, args)", self.kinetic)
@@ -83,6 +85,7 @@ class HamiltonianSystem(AbstractCanonicalSystem):
     constraint: Callable[[Coordinates, Args], Multipliers] | None = None
     force: Force | None = None
     driven: Driven | None = None
+    redundant: bool = eqx.field(default=False, static=True)
 
     def __check_init__(self):
         check_function("hamiltonian", "(q, p, args)", self.hamiltonian)

@@ -1,5 +1,6 @@
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
@@ -39,6 +40,9 @@ class System(AbstractSystem):
     - `driven`: `driven(q, t, args)`, a vector that vanishes in every admissible
       configuration at time `t`: a pivot that is moved, a prescribed angle. Held as
       `constraint` is, and twice differentiable in `t`.
+    - `redundant`: whether constraints may repeat each other, as those of over-constrained
+      mechanisms do. Multipliers are then of least norm (each in the measure of its
+      constraint), to the order of the scheme; the motion does not depend on it.
 
     `args` is any pytree; the functions must be smooth and written with `jax.numpy`.
 
@@ -54,6 +58,7 @@ class System(AbstractSystem):
     coordinate_constraint: Callable[[Coordinates, Args], Multipliers] | None
     force: Force | None
     driven: Driven | None
+    redundant: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -65,6 +70,7 @@ class System(AbstractSystem):
         coordinate_constraint: Callable[[Coordinates, Args], Multipliers] | None = None,
         force: Force | None = None,
         driven: Driven | None = None,
+        redundant: bool = False,
     ):
         check_function("potential", "(q, args)", potential)
         for name, value in [
@@ -90,6 +96,7 @@ class System(AbstractSystem):
         self.coordinate_constraint = coordinate_constraint
         self.force = force
         self.driven = driven
+        self.redundant = redundant
         self.kinematics = (
             IdentityKinematics()
             if kinematics is None
@@ -125,6 +132,7 @@ class System(AbstractSystem):
         *,
         force: Force | None = None,
         driven: Driven | None = None,
+        redundant: bool = False,
     ) -> LagrangianSystem:
         """A system whose inertia depends on its coordinates.
 
@@ -142,7 +150,7 @@ class System(AbstractSystem):
         - `constraint`: `constraint(q, args)`, a vector that vanishes in every admissible
           configuration. Leave it out if there is none.
         - `force`: `force(q, qdot, t, args)`, shape `(nq,)`, conjugate to `qdot`.
-        - `driven`: `driven(q, t, args)`; see `System` for both.
+        - `driven`: `driven(q, t, args)`; `redundant`: see `System`.
 
         **Returns:** what all functions take for a `System`; the `v` of a `State` is
         `qdot`, shape `(nq,)`.
@@ -153,6 +161,7 @@ class System(AbstractSystem):
             constraint=constraint,
             force=force,
             driven=driven,
+            redundant=redundant,
         )
 
     @staticmethod
@@ -162,6 +171,7 @@ class System(AbstractSystem):
         *,
         force: Force | None = None,
         driven: Driven | None = None,
+        redundant: bool = False,
     ) -> HamiltonianSystem:
         """A system given by its Hamiltonian.
 
@@ -177,11 +187,15 @@ class System(AbstractSystem):
         - `constraint`: as for `from_lagrangian`. It is held in `q`, and
           `B(q) dH/dp = 0` in `p`.
         - `force`: `force(q, qdot, t, args)`, shape `(nq,)`, conjugate to `qdot = dH/dp`.
-        - `driven`: `driven(q, t, args)`; see `System` for both.
+        - `driven`: `driven(q, t, args)`; `redundant`: see `System`.
 
         **Returns:** what all functions take for a `System`; the `v` of a `State` is the
         momentum `p`, shape `(nq,)`. The audit counts `H(q, 0)` as potential energy.
         """
         return HamiltonianSystem(
-            hamiltonian=hamiltonian, constraint=constraint, force=force, driven=driven
+            hamiltonian=hamiltonian,
+            constraint=constraint,
+            force=force,
+            driven=driven,
+            redundant=redundant,
         )

@@ -1,0 +1,125 @@
+"""Over-constrained mechanisms: multipliers of least norm, the motion of the rest."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import enerjax as ej
+
+from .helpers import EPS, SCHEMES
+
+
+ANGLE, SPEED, G = 1.0, 2.0, 9.81
+
+
+def _bars(num_bars, length):
+    """A beam of two points on two to four parallel bars of a given length."""
+
+    def constraint(q, args):
+        left, right = q[:2], q[2:]
+        feet = jnp.array([0.0, 2.0, 1.0, 0.5])
+        heads = [left, right, 0.5 * (left + right), 0.75 * left + 0.25 * right]
+        bars = jnp.stack(heads) - jnp.stack([feet, jnp.zeros(4)], axis=1)
+        rows = jnp.sum(bars**2, axis=1)[:num_bars] - length(args) ** 2
+        return jnp.append(rows, (right - left) @ (right - left) - 4)
+
+    return constraint
+
+
+def _beam(num_bars, redundant):
+    system = ej.System(
+        lambda v, args: 0.5 * args["m"] * v @ v,
+        lambda q, args: args["m"] * G * (q[1] + q[3]),
+        _bars(num_bars, lambda args: args["l"]),
+        redundant=redundant,
+    )
+    args = {"m": jnp.asarray(1.5), "l": jnp.asarray(1.0)}
+    return system, args
+
+
+def _start(system, args):
+    up = jnp.array([jnp.cos(ANGLE), jnp.sin(ANGLE)])
+    across = SPEED * jnp.array([-jnp.sin(ANGLE), jnp.cos(ANGLE)])
+    q = jnp.concatenate([up, up + jnp.array([2.0, 0.0])])
+    return ej.initial_state(system, q, jnp.tile(across, 2), args)
+
+
+def _run(num_bars, scheme, h, steps, redundant=True):
+    system, args = _beam(num_bars, redundant)
+    start = _start(system, args)
+    return ej.simulate(
+        system, SCHEMES[scheme](0.5), start, args, h=h, num_steps=steps, save_every=5
+    )
+
+
+@functools.cache
+def _exact():
+    """The bars swing as one pendulum; half a second stays clear of the flat pose."""
+    rate = lambda t, y: [y[1], -G * np.cos(y[0])]
+    run = solve_ivp(rate, (0, 0.5), [ANGLE, SPEED], method="DOP853", rtol=1e-12, atol=1e-12)
+    angle = run.y[0, -1]
+    up = np.array([np.cos(angle), np.sin(angle)])
+    return np.concatenate([up, up + [2, 0]])
+
+
+def test_without_being_declared_they_are_refused():
+    system, args = _beam(3, redundant=False)
+    with pytest.raises(ValueError, match="redundant=True"):
+        _start(system, args)
+
+
+@pytest.mark.parametrize("scheme", ["preserving", "decaying", "consistent"])
+def test_the_motion_is_that_of_the_independent_constraints(scheme):
+    runs = [_run(4, scheme, h, n) for h, n in ((5e-3, 100), (2.5e-3, 200))]
+    error = [np.max(np.abs(run.ys.q[-1] - _exact())) for run in runs]
+    order = np.log2(error[0] / error[1])
+    # Truncation.
+    assert order >= {"preserving": 1.9, "decaying": 1.9, "consistent": 2.8}[scheme]
+    assert error[1] <= 1e-4
+    run = runs[1]
+    leak = np.diff(run.audit.energy) + run.audit.dissipated[1:]
+    assert np.max(np.abs(leak)) <= 1e3 * EPS * 2 * G  # solver
+    assert np.max(np.abs(run.audit.constraint)) <= 1e-13  # solver
+    # Solver: round-off in the directions that the equations leave open is not reduced.
+    assert np.max(np.abs(run.audit.constraint_rate)) <= 2e-11
+
+
+def test_multipliers_are_of_least_norm():
+    system, args = _beam(4, redundant=True)
+    state = _start(system, args)
+    found = ej.consistent_start(system, state.q, state.v, args)
+    assert system.constraint is not None
+    jacobian = np.asarray(jax.jacfwd(system.constraint)(state.q, args))
+    force = np.array([0, 1.5 * G, 0, 1.5 * G]) + 1.5 * np.asarray(found.accelerations)
+    # Each row in the measure of its constraint.
+    size = np.linalg.norm(jacobian, axis=1)
+    least = np.linalg.lstsq((jacobian / size[:, None]).T, -force, rcond=1e-10)[0] / size
+    # Round-off of forces of some 15, divided by what makes the equations regular.
+    np.testing.assert_allclose(found.multipliers, least, atol=15 * EPS**0.5)
+    for h in (1e-3, 1e-4):
+        mean = _run(4, "preserving", h, 5).multipliers[-1]
+        np.testing.assert_allclose(mean, least, atol=80 * h)  # truncation: of five steps
+
+
+def test_derivatives_are_unique():
+    def tip(l, num_bars, redundant):
+        system, args = _beam(num_bars, redundant)
+        args = args | {"l": l}
+        start = _start(system, args)
+        run = ej.simulate(
+            system, ej.EnergyPreserving(), start, args, h=5e-3, num_steps=40, throw=False
+        )
+        return run.ys.q[-1, 1]
+
+    forward = jax.jvp(lambda l: tip(l, 4, True), (1.0,), (1.0,))[1]
+    reverse = jax.grad(lambda l: tip(l, 4, True))(1.0)
+    assert forward == pytest.approx(float(reverse), rel=1e-9)  # solver
+    step = 1e-5
+    change = (tip(1 + step, 4, True) - tip(1 - step, 4, True)) / (2 * step)
+    assert reverse == pytest.approx(float(change), rel=1e-7)  # truncation
+    least = jax.grad(lambda l: tip(l, 2, False))(1.0)
+    assert reverse == pytest.approx(float(least), rel=2e-3)  # truncation, of the scheme
