@@ -205,3 +205,29 @@ def test_far_from_the_origin_a_wrong_length_is_still_seen():
     )
     assert run(1.0).result == ej.RESULTS.successful
     assert run(1.0 + 1e-3).result == ej.RESULTS.inconsistent_start
+
+
+def test_known_entries_stay_and_the_rest_follows():
+    system, _, args = problem("double")
+
+    def start(x, u):
+        q, v = jnp.array([x, 0.7, 1.5, 0.9]), jnp.array([u, 0.1, 0.3, 0.2])
+        return ej.initial_state(system, q, v, args, known_q=[0, 3], known_v=[0, 2])
+
+    state = start(0.6, 1.0)
+    np.testing.assert_allclose(state.q[:2], [0.6, 0.8], rtol=1e-13)  # solver
+    assert state.q[3] == pytest.approx(0.9, abs=1e-14)
+    np.testing.assert_allclose(state.q[2], 0.6 + np.sqrt(1 - 0.1**2), rtol=1e-13)
+    np.testing.assert_allclose(state.v[:3], [1.0, -0.75, 0.3], rtol=1e-13)
+    by_x = jax.jacfwd(lambda x: start(x, 1.0).q[1])(0.6)
+    assert by_x == pytest.approx(-0.75, rel=1e-12)  # solver
+
+
+def test_too_much_that_is_known_is_told():
+    system, _, args = problem("pendulum")
+    with pytest.raises(ValueError, match="what is known leaves enough to move"):
+        ej.initial_state(system, [0.9, 0.1], [0.0, 0.0], args, known_q=[0, 1])
+    with pytest.raises(ValueError, match="what is known leaves enough to move"):
+        ej.initial_state(system, [0.6, 0.8], [1.0, 0.0], args, known_v=[0, 1])
+    with pytest.raises(ValueError, match="numbers from 0 to 1"):
+        ej.initial_state(system, [0.6, 0.8], [1.0, 0.0], args, known_v=[2])

@@ -1,24 +1,19 @@
 """Consistent starts: positions, velocities, accelerations and multipliers."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ._check import check_system
-from ._linear import affine_root, largest, Symmetric
-from ._model import AbstractModel, make_model, Time
-from ._newton import Newton
-from ._root import find_root
-from ._system import AbstractSystem, HamiltonianSystem, State
+from ._model import make_model
+from ._projection import project_position, project_velocity, rank_of_constraints
+from ._system import AbstractSystem, State, System
 from ._tracing import is_known
-from ._types import Args, Coordinates, Count, Flag, Multipliers, Real, Vector, Velocities
-
-
-# Coordinates from which the rank of the constraints is not counted.
-_LARGE = 500
+from ._types import Args, Count, Flag, Multipliers, Real, Vector, Velocities
 
 
 class ConsistentStart(eqx.Module):
@@ -43,17 +38,32 @@ class ConsistentStart(eqx.Module):
 
 
 def initial_state(
-    system: AbstractSystem, q: Vector, v: Vector, args: Args = None, *, t: Real = 0.0
+    system: AbstractSystem,
+    q: Vector,
+    v: Vector,
+    args: Args = None,
+    *,
+    t: Real = 0.0,
+    known_q: Sequence[int] = (),
+    known_v: Sequence[int] = (),
 ) -> State:
     """The `State` nearest to `(q, v)` that satisfies the constraints.
 
     As `consistent_start`, of which it returns the state alone.
     """
-    return consistent_start(system, q, v, args, t=t).state
+    start = consistent_start(system, q, v, args, t=t, known_q=known_q, known_v=known_v)
+    return start.state
 
 
 def consistent_start(
-    system: AbstractSystem, q: Vector, v: Vector, args: Args = None, *, t: Real = 0.0
+    system: AbstractSystem,
+    q: Vector,
+    v: Vector,
+    args: Args = None,
+    *,
+    t: Real = 0.0,
+    known_q: Sequence[int] = (),
+    known_v: Sequence[int] = (),
 ) -> ConsistentStart:
     """Projects a start onto the constraints and solves for what is in balance there.
 
@@ -71,6 +81,8 @@ def consistent_start(
       second correction must be less than a fifth of the first.)
     - `args`: handed to the functions of the system.
     - `t`: the time of the start, for `force` and `driven`.
+    - `known_q`, `known_v`: numbers of the coordinates and velocities that stay as they are
+      given; the others are solved for.
 
     **Returns:** a `ConsistentStart`.
 
@@ -80,13 +92,19 @@ def consistent_start(
     independent at the start, with their rank.
     """
     state, args = check_system(system, State(q, v), args, t)
-    start, near, rank = _project(system, state, args)
+    known = _numbers("known_q", known_q, state.q), _numbers("known_v", known_v, state.v)
+    if known[1] and not isinstance(system, System):
+        raise ValueError(
+            "`known_v`: only the velocities of a plain `System` can be given in part."
+        )
+    start, near, rank = _project(system, state, args, known)
     start = _raise_unless(
         near,
         start,
         "The start is too far from the constraints to be repaired: their linearisation "
         "does not explain the error, so the nearest admissible configuration may not be "
-        "the one that was meant. Check it against the lengths and anchors in `args`.",
+        "the one that was meant. Check it against the lengths and anchors in `args`"
+        + (", and whether what is known leaves enough to move." if any(known) else "."),
         lambda: f"Residual of the constraints: {start.constraint_before}.",
     )
     num_constraints = start.multipliers.size
@@ -102,10 +120,6 @@ def consistent_start(
     )
 
 
-def _constraint_at(model: AbstractModel, t: Time) -> Callable[[Coordinates], Multipliers]:
-    return lambda q: model.constraint(q, t)
-
-
 def _raise_unless(
     good: Flag, start: ConsistentStart, message: str, figures: Callable[[], str]
 ) -> ConsistentStart:
@@ -117,16 +131,33 @@ def _raise_unless(
     return start
 
 
+def _numbers(name: str, numbers: Sequence[int], x: Array) -> tuple[int, ...]:
+    """Checked numbers of entries of a vector."""
+    array = np.asarray(numbers)
+    if array.size == 0:
+        return ()
+    bad = array.ndim != 1 or not np.issubdtype(array.dtype, np.integer)
+    if bad or np.any(array < 0) or np.any(array >= x.size):
+        raise ValueError(
+            f"`{name}` must be a list of numbers from 0 to {x.size - 1}, got {numbers}."
+        )
+    return tuple(sorted(set(array.tolist())))
+
+
 @eqx.filter_jit
 def _project(
-    system: AbstractSystem, guess: State, args: Args
+    system: AbstractSystem,
+    guess: State,
+    args: Args,
+    known: tuple[tuple[int, ...], tuple[int, ...]],
 ) -> tuple[ConsistentStart, Flag, Count]:
     model = make_model(system, guess, args)
     t = guess.t
     before = model.constraint(guess.q, t)
-    q, near = _project_position(model, guess)
+    q, near = project_position(model, guess, known[0])
     given = model.enter(State(q, guess.v, t))
-    state = State(q, _project_velocity(model, given), t)
+    velocity, admitted = project_velocity(model, given, known[1])
+    state, near = State(q, velocity, t), near & admitted
     acceleration, multipliers = model.accelerations(state)
     rates = State(model.lift(q, state.v), acceleration, jax.tree.map(jnp.ones_like, t))
     user_state, user_rates = jax.jvp(model.leave, (state,), (rates,))
@@ -139,110 +170,4 @@ def _project(
         model.joint_rate(q, given.v, t),
         model.joint_rate(q, state.v, t),
     )
-    return start, near, jax.lax.stop_gradient(_rank(model, state))
-
-
-def _rank(model: AbstractModel, state: State) -> Count:
-    """The rank of the Jacobian of the constraints; of a large one, full or less."""
-    q, constraint, scales = state.q, _constraint_at(model, state.t), model.scales
-    num_constraints = scales.constraint.size
-    if num_constraints == 0:
-        return jnp.array(0)
-    if q.size <= _LARGE:
-        jacobian = jax.jacfwd(constraint)(q)
-        unit = jacobian / scales.coordinate[None, :] / scales.constraint[:, None]
-        return jnp.linalg.matrix_rank(unit)
-    # A vector is found again from its product with `B B^T` only if that is regular.
-    _, transpose = jax.vjp(constraint, q)
-
-    def product(mu: Multipliers) -> Multipliers:
-        motion = transpose(mu / scales.constraint)[0] / scales.coordinate**2
-        return jax.jvp(constraint, (q,), (motion,))[1] / scales.constraint
-
-    probe = jnp.cos(jnp.arange(num_constraints, dtype=q.dtype))
-    image = product(probe)
-    again = affine_root(lambda mu: product(mu) - image, probe)
-    found = largest(again - probe) <= jnp.finfo(q.dtype).eps ** 0.25
-    return num_constraints - 1 + found.astype(int)
-
-
-def _project_position(model: AbstractModel, state: State) -> tuple[Coordinates, Flag]:
-    """The nearest configuration on the constraints, and whether it could be found."""
-    guess, t = state.q, state.t
-    if model.scales.constraint.size == 0:
-        return guess, jnp.array(True)
-    metric, scales = model.metric(model.enter(state)), model.scales
-    size = largest(guess * scales.coordinate)
-    size = jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
-
-    def conditions(x, inputs):
-        """The nearest point: `metric (q - guess) + B^T mu = 0`, `Phi(q) = 0`."""
-        model, metric, guess, t, size = inputs
-        scales = model.scales
-        shift, mu = size * x[0] / scales.coordinate, size * x[1] / scales.constraint
-        constraint, pull = jax.vjp(_constraint_at(model, t), guess + shift)
-        force = metric @ shift + pull(mu)[0]
-        rows = size * scales.constraint + scales.constraint_size
-        return force / (size * scales.coordinate), constraint / rows
-
-    inputs = (model, metric, guess, t, size)
-    zero = (jnp.zeros_like(guess), jnp.zeros_like(scales.constraint))
-    tolerance = 1e2 * jnp.finfo(guess.dtype).eps
-    fill = model.fill(scales.constraint.size, guess.dtype)
-    fill = None if fill is None else (zero[0], fill)
-    root = find_root(conditions, Newton(), zero, inputs, max_iterations=50, fill=fill)
-    x, found = root.value, root.found
-    # Constraints that are met are not far; whether they are independent is told apart.
-    met = largest(conditions(zero, inputs)[1]) <= tolerance
-    near = met | (found & _linear(model, metric, state))
-    q = jnp.where(met & ~found, guess, guess + size * x[0] / scales.coordinate)
-    return q, near
-
-
-def _linear(model: AbstractModel, metric: Symmetric, state: State) -> Flag:
-    """Whether the linearised constraints explain the error of a state.
-
-    The natural monotonicity test of P. Deuflhard, Newton Methods for Nonlinear Problems
-    (2004): a simplified second correction shorter than a fifth of the first. (From
-    infinitely far from a sphere it is a quarter.)
-    """
-    q, constraint, scales = state.q, _constraint_at(model, state.t), model.scales
-    _, transpose = jax.vjp(constraint, q)
-
-    def correction(residual: Multipliers) -> Coordinates:
-        """The shortest with this effect on the constraints."""
-
-        def conditions(x: Array) -> Array:
-            shift, mu = x[: q.size] / scales.coordinate, x[q.size :] / scales.constraint
-            change = jax.jvp(constraint, (q,), (shift,))[1] - residual
-            force = metric @ shift + transpose(mu)[0]
-            return jnp.concatenate([force / scales.coordinate, change / scales.constraint])
-
-        like = jnp.zeros((q.size + residual.size,), q.dtype)
-        x = affine_root(conditions, like, model.fill_behind(q))
-        return x[: q.size] / scales.coordinate
-
-    first = correction(constraint(q))
-    second = correction(constraint(q - first))
-    length = lambda x: jnp.sqrt(x @ metric @ x)
-    return length(second) <= 0.2 * length(first)
-
-
-def _project_velocity(model: AbstractModel, state: State) -> Velocities:
-    """The nearest velocities (or momenta) that the joints admit."""
-    q, v, t = state.q, state.v, state.t
-    if model.joint(q, t).size == 0:
-        return v
-
-    def correct(v: Velocities, _) -> tuple[Velocities, None]:
-        mobility, rates = model.mobility(State(q, v)), lambda v: model.joint_rate(q, v, t)
-        rate, transpose = jax.vjp(rates, v)
-        unit = model.scales.constraint[: rate.size]
-        change = lambda mu: mobility @ transpose(mu / unit)[0]
-        remaining = lambda mu: (rate - jax.jvp(rates, (v,), (change(mu),))[1]) / unit
-        fill = model.fill(rate.size, v.dtype)
-        return v - change(affine_root(remaining, rate, fill)), None
-
-    # Exact at once where the energy is a quadratic form of the momenta; else Newton.
-    corrections = 8 if isinstance(model.system, HamiltonianSystem) else 1
-    return jax.lax.scan(correct, v, None, length=corrections)[0]
+    return start, near, jax.lax.stop_gradient(rank_of_constraints(model, state))

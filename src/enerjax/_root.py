@@ -75,7 +75,7 @@ def _search(
     given, fill = root_finder.linear_solver, _flat(start.fill)
     residual = linearisable(flat_fn, flat, args, given, fill)
     last = newton_iterations(residual, root_finder, start, max_iterations)
-    keeps = residual.is_dense and start.factors is not None
+    keeps = residual.keeps_factors and start.factors is not None
     factors = last.factors if keeps else start.factors
     return Root(unravel(last.x), factors, last.corrections, last.done, last.broken)
 

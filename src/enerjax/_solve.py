@@ -5,7 +5,6 @@ gradients of their constraints, and everything by an energy of the step.
 """
 
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -152,14 +151,15 @@ def _attempt(
         # What the last steps suggest can lie beyond a fold of the step equations; the
         # flight without force starts on the near side.
         second_guess=jax.tree.map(jnp.divide, flight, unknown_scale),
-        fill=_fill(model, guess),
+        fill=_fill(model, unknown_scale, row_scale),
     )
     root = find(guess=guess, factors=memory.factors, skip=skip)
     if model.system.redundant:
         # Again, from where constraints that repeat each other agree, and without forces:
         # what is left open of these by the equations stays zero.
         first = root
-        guess = _map_multipliers(jnp.zeros_like, root.value)
+        none = jax.tree.map(jnp.zeros_like, root.value)
+        guess = _with_multipliers(root.value, none)
         root = find(guess=guess, factors=root.factors, skip=skip | ~root.found)
         root = eqx.tree_at(
             lambda root: (root.iterations, root.found, root.broken),
@@ -188,21 +188,30 @@ def _attempt(
     return end, root.iterations, result, memory
 
 
-def _map_multipliers(fn: Callable[[Array], Array], z: PyTree[Any]) -> PyTree[Any]:
-    """`fn` of the multipliers among unknowns."""
+def _with_multipliers(z: PyTree[Any], values: PyTree[Any]) -> PyTree[Any]:
+    """Unknowns with the multipliers of others."""
     parts = lambda x: (x.impulse, x.velocity_impulse)
-    change = lambda x: (
-        eqx.tree_at(parts, x, replace_fn=fn) if isinstance(x, Increment) else x
-    )
-    return jax.tree.map(change, z, is_leaf=lambda x: isinstance(x, Increment))
+    is_increment = lambda x: isinstance(x, Increment)
+    change = lambda x, y: eqx.tree_at(parts, x, parts(y)) if is_increment(x) else x
+    return jax.tree.map(change, z, values, is_leaf=is_increment)
 
 
-def _fill(model: AbstractModel, z: PyTree[Any]) -> PyTree[Any] | None:
-    """What makes the step equations regular where constraints repeat each other."""
+def _fill(model: AbstractModel, unknown_scale: Any, row_scale: Any) -> Any | None:
+    """What makes the step equations regular where constraints repeat each other.
+
+    Weighed by the scales of row and unknown, so that the multipliers of least norm are
+    those of least norm in the measure of their constraints.
+    """
     if not model.system.redundant:
         return None
-    zero = jax.tree.map(jnp.zeros_like, z)
-    return _map_multipliers(lambda x: jnp.asarray(model.fill(x.size, x.dtype)), zero)
+
+    def weigh(unit: Array, row: Array) -> Array:
+        product = unit * row
+        share = jnp.min(product, initial=jnp.inf) / product
+        return share * jnp.asarray(model.fill(unit.size, unit.dtype))
+
+    none = jax.tree.map(jnp.zeros_like, unknown_scale)
+    return _with_multipliers(none, jax.tree.map(weigh, unknown_scale, row_scale))
 
 
 def _free_flight(

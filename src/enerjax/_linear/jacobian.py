@@ -49,6 +49,11 @@ class Linearisable(eqx.Module):
         """Whether its Jacobian is dense, and solved with as this package sees fit."""
         return isinstance(self.form, Full) and self.form.solver is None
 
+    @property
+    def keeps_factors(self) -> bool:
+        """Whether the next iteration can begin with the factors of this one."""
+        return self.is_dense and self.fill is None
+
     def jacobian(self, x: Float[Array, " n"]) -> Array:
         """The Jacobian, in the form that `first_factors` are renewed with."""
         fill = self.fill
@@ -60,7 +65,7 @@ class Linearisable(eqx.Module):
         self, kept: AbstractFactors | None, x: Float[Array, " n"]
     ) -> AbstractFactors:
         """What the first Jacobian of an iteration renews."""
-        if kept is not None and self.is_dense:
+        if kept is not None and self.keeps_factors:
             return kept
         return self.form.empty(x.size, x.dtype)
 
@@ -80,7 +85,8 @@ class Linearisable(eqx.Module):
         self, x: Float[Array, " n"], matrix: Array, right: Float[Array, " n"]
     ) -> Array:
         if self.is_dense:
-            return solve(matrix, right)
+            # An explicit inverse loses too many digits of what is nearly singular.
+            return (solve if self.fill is None else jnp.linalg.solve)(matrix, right)
         factors = self.form.empty(x.size, x.dtype).renewed(matrix)
         factors = jax.lax.stop_gradient(factors)
 

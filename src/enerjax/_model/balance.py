@@ -42,7 +42,7 @@ def accelerations(model: "SeparableModel", state: State) -> tuple[Velocities, Mu
         return jnp.concatenate(rows)
 
     like = jnp.zeros((v.size + scales.constraint.size,), q.dtype)
-    x = affine_root(conditions, like, model.fill_behind(v))
+    x = affine_root(conditions, like, model.fill_behind(v, scales.constraint.size))
     return unit * x[: v.size], x[v.size :] / scales.constraint
 
 

@@ -209,9 +209,9 @@ class AbstractModel(eqx.Module):
             return None
         return jnp.full((count,), -(float(jnp.finfo(dtype).eps) ** 0.5), dtype)
 
-    def fill_behind(self, x: Array) -> Float[Array, " n"] | None:
-        """The same for equations in `x` and a multiplier for each constraint."""
-        fill = self.fill(self.scales.constraint.size, x.dtype)
+    def fill_behind(self, x: Array, count: int) -> Float[Array, " n"] | None:
+        """The same for equations in `x` and `count` multipliers."""
+        fill = self.fill(count, x.dtype)
         return None if fill is None else jnp.concatenate([jnp.zeros_like(x), fill])
 
     def energy_scale(self, state: State, h: Scalar) -> Scalar:
