@@ -35,7 +35,9 @@ from ._schemes import (
     EnergyConsistent as EnergyConsistent,
     EnergyDecaying as EnergyDecaying,
     EnergyPreserving as EnergyPreserving,
+    GeneralizedAlpha as GeneralizedAlpha,
     KappaDecaying as KappaDecaying,
+    Rattle as Rattle,
 )
 from ._simulate import simulate as simulate
 from ._solution import Solution as Solution, Statistics as Statistics
