@@ -128,6 +128,7 @@ def solve(
             drive_work,
             jax.tree.map(lambda x: x[-1], ends.details),
             first_of(ends.result),
+            jax.tree.map(lambda x: x[-1], ends.carried),
         )
         return end, iterations + jnp.sum(counts), first_of(results), begin(state, h)
 

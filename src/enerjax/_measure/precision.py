@@ -2,7 +2,6 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-
 from .._check import positive_integer
 from .._schemes import AbstractScheme
 from .reference import Reals
@@ -69,7 +68,7 @@ class WorkPrecision:
     uncertainty: dict[str, float]
 
     def __str__(self) -> str:
-        rows = [_HEADER]
+        rows: list[tuple[str, ...]] = [_HEADER]
         for i, name in enumerate(self.schemes):
             for j, h in enumerate(self.h):
                 errors = [number(getattr(self, x)[i, j]) for x in _COLUMNS[:-2]]
@@ -83,7 +82,9 @@ class WorkPrecision:
         """Error of the positions against time and against corrections, as a figure."""
         import matplotlib.pyplot as plt
 
-        figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained", sharey=True)
+        figure, axes = plt.subplots(
+            1, 2, figsize=(10, 4), layout="constrained", sharey=True
+        )
         for name, error, *costs in zip(
             self.schemes, self.q, self.seconds, self.evaluations, strict=True
         ):

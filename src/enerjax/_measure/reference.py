@@ -72,8 +72,17 @@ def _run(
     num_steps: int,
     save_every: int,
 ) -> Solution:
-    counts = dict(num_steps=num_steps, save_every=save_every)
-    return simulate(system, scheme, start, args, h=h, t0=t0, throw=False, **counts)
+    return simulate(
+        system,
+        scheme,
+        start,
+        args,
+        h=h,
+        num_steps=num_steps,
+        t0=t0,
+        save_every=save_every,
+        throw=False,
+    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -139,7 +139,7 @@ def _run(
         return Run(failure=f"refused: {_first_sentence(str(error))}")
     if solution.result != RESULTS.successful:
         at = task.t0 + int(solution.stats.completed_steps) * task.duration / num_steps
-        cause = _first_sentence(RESULTS[solution.result])
+        cause = _first_sentence(RESULTS[solution.result]).split(":")[0]
         return Run(failure=f"failed at t = {at:.4g}: {cause}")
     seconds = [_timed(task, scheme, num_steps) for _ in range(repeats)]
     errors = _errors(task, exact, solution, num_steps)

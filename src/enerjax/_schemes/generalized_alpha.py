@@ -1,6 +1,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from .._model import AbstractModel, Increment
 from .._results import RESULTS
@@ -54,11 +55,12 @@ class GeneralizedAlpha(AbstractCarryingSolve[Increment, _AlphaProblem]):
       reactions at both ends, by the trapezoidal rule.
     - Constraints held at: position level; with `formulation="ggl"` velocity level too, by
       `- h M^-1 B0^T eta` in the line of `q1`.
-    - Order: 2, with `rho_inf < 1` where there are constraints: at 1 (and for `newmark`)
-      what a step leaves in the multipliers does not decay.
+    - Order: 2, in the multipliers too, once the first steps have decayed: a run begins
+      with `a0 = vdot0`. That needs `rho_inf < 1` where there are constraints: at 1 (and
+      for `newmark`) what a step leaves in the multipliers does not decay.
     - Multipliers: `lambda1`, those at the end of the step.
     - For a `System` without `kinematics`. Others raise a `ValueError`.
-    - `step` without `warm` begins anew, with `a0 = vdot0`.
+    - `step` without `warm` begins anew.
 
     **Arguments:**
 
@@ -102,7 +104,7 @@ class GeneralizedAlpha(AbstractCarryingSolve[Increment, _AlphaProblem]):
         **Reference:** H. M. Hilber, T. J. R. Hughes and R. L. Taylor, Earthq. Eng. Struct.
         Dyn. 5 (1977) 283-292.
         """
-        if is_known(alpha) and not -1 / 3 <= float(alpha) <= 0:
+        if is_known(alpha) and not -1 / 3 <= float(np.real(alpha)) <= 0:
             raise ValueError(
                 f"`GeneralizedAlpha.hht(alpha={alpha})`: alpha must lie in [-1/3, 0]; -1/3 "
                 "damps high frequencies most, 0 not at all."
@@ -121,7 +123,7 @@ class GeneralizedAlpha(AbstractCarryingSolve[Increment, _AlphaProblem]):
 
         **Reference:** N. M. Newmark, J. Eng. Mech. Div. 85 (1959) 67-94.
         """
-        if is_known(beta) and not float(beta) > 0:
+        if is_known(beta) and not float(np.real(beta)) > 0:
             raise ValueError(
                 f"`GeneralizedAlpha.newmark(beta={beta})`: beta must be positive, for the "
                 "constraints reach the accelerations through it. The explicit scheme for "
