@@ -87,7 +87,8 @@ def test_the_double_pendulum_from_the_horizontal(scheme, tip, largest):
 def test_order_on_the_double_pendulum(scheme):
     system, start, args = problem("double")
     exact, method = double_pendulum_reference(2.0), SCHEMES[scheme]
-    counts = (100, 200, 400)
+    # What the start of generalized-alpha leaves in the multipliers is gone after 200 steps.
+    counts = (100, 200, 400) if scheme == "rattle 4" else (200, 400, 800)
     runs = [march(system, method, start, args, h=2 / n, steps=n) for n in counts]
     for error in (
         [np.max(np.abs(run.state.q - exact.q)) for run in runs],

@@ -91,7 +91,7 @@ class GeneralizedAlpha(AbstractCarryingSolve[Increment, _AlphaProblem]):
         self.alpha_f = 0.5 * (1 - alpha)
         self.beta = 0.25 * (1 + alpha) ** 2
         self.gamma = 0.5 + alpha
-        self.formulation = formulation
+        self.formulation = formulation  # pyright: ignore[reportIncompatibleMethodOverride]
 
     @classmethod
     def hht(
