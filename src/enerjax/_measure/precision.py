@@ -49,8 +49,8 @@ class WorkPrecision:
     - `uncertainty`: of the reference, for `q`, `v` and `multipliers`; errors below it
       mean nothing. 0 for given data.
 
-    NaN stands where a run failed and where the reference says nothing. `print` shows a
-    table.
+    NaN stands where a run failed, where the reference says nothing, and for constraints
+    and multipliers that a system does not have. `print` shows a table.
     """
 
     schemes: tuple[str, ...]

@@ -25,7 +25,7 @@ Given: TypeAlias = AbstractScheme | Sequence[ArrayLike] | None
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """One run; its numbers are NaN where it failed, or nothing is known."""
+    """One run; its numbers are NaN where it failed, and where there is nothing to know."""
 
     q: float = math.nan
     v: float = math.nan
@@ -174,7 +174,7 @@ def _timed(task: Task, scheme: AbstractScheme, num_steps: int) -> float:
 
 
 def _largest(x: Reals) -> float:
-    return float(np.max(np.abs(x), initial=0.0))
+    return float(np.max(np.abs(x))) if x.size > 0 else math.nan
 
 
 def _first_sentence(message: str) -> str:

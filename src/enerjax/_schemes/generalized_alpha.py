@@ -69,10 +69,10 @@ class GeneralizedAlpha(AbstractCarryingSolve[Increment, _AlphaProblem]):
 
     **Raises:** `ValueError` for a concrete `rho_inf` outside [0, 1].
 
-    **Reference:** J. Chung and G. M. Hulbert, J. Appl. Mech. 60 (1993) 371-375, eq. (25)
-    for the coefficients; M. Arnold and O. Bruls, Multibody Syst. Dyn. 18 (2007) 185-202,
-    eq. (10) to (12) for the constrained form. The stabilised form: C. Lunk and B. Simeon,
-    Z. Angew. Math. Mech. 86 (2006) 772-784.
+    **Reference:** J. Chung and G. M. Hulbert, J. Appl. Mech. 60 (1993) 371-375, for the
+    coefficients; M. Arnold and O. Bruls, Multibody Syst. Dyn. 18 (2007) 185-202, for the
+    constrained form with `a`. Stabilised in the manner of C. Lunk and B. Simeon, Z. Angew.
+    Math. Mech. 86 (2006) 772-784.
     """
 
     alpha_m: Scalar
