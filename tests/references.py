@@ -21,8 +21,11 @@ def pendulum_reference(t, g=9.81, l=1.0):
 
 
 @functools.cache
-def double_pendulum_reference(t, m1=1.0, m2=1.0, g=9.81):
-    """Points and velocities of two unit rods; angles from +x towards +y, gravity +y."""
+def double_pendulum_reference(t, m1=1.0, m2=1.0, g=9.81, outer=np.pi / 2):
+    """Points and velocities of two unit rods; angles from +x towards +y, gravity +y.
+
+    The inner rod starts horizontal, the outer one at the angle `outer`.
+    """
 
     def rates(_, y):
         a, b, da, db = y
@@ -35,7 +38,7 @@ def double_pendulum_reference(t, m1=1.0, m2=1.0, g=9.81):
         ]
         return [da, db, *np.linalg.solve(inertia, torque)]
 
-    a, b, da, db = _integrate(rates, [0.0, np.pi / 2, 0.0, 0.0], t)
+    a, b, da, db = _integrate(rates, [0.0, outer, 0.0, 0.0], t)
     inner, outer = np.array([np.cos(a), np.sin(a)]), np.array([np.cos(b), np.sin(b)])
     turn = np.array([[0, -1], [1, 0]])
     v_inner, v_outer = da * turn @ inner, db * turn @ outer

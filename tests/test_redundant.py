@@ -102,7 +102,7 @@ def test_multipliers_are_of_least_norm():
     np.testing.assert_allclose(found.multipliers, least, atol=15 * EPS**0.5)
     for h in (1e-3, 1e-4):
         mean = _run(4, "preserving", h, 5).multipliers[-1]
-        np.testing.assert_allclose(mean, least, atol=80 * h)  # truncation: of five steps
+        np.testing.assert_allclose(mean, least, atol=100 * h)  # truncation: of five steps
 
 
 def test_derivatives_are_unique():

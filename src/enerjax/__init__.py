@@ -10,6 +10,7 @@ from ._analysis import (
     modes as modes,
 )
 from ._audit import Audit as Audit
+from ._diffrax import IndexReduced as IndexReduced, to_diffrax as to_diffrax
 from ._discrete import (
     AbstractDerivative as AbstractDerivative,
     ChainRule as ChainRule,
@@ -27,6 +28,12 @@ from ._initial import (
     initial_state as initial_state,
 )
 from ._linear import KLU as KLU
+from ._measure import (
+    order_table as order_table,
+    OrderTable as OrderTable,
+    work_precision as work_precision,
+    WorkPrecision as WorkPrecision,
+)
 from ._newton import Newton as Newton
 from ._results import RESULTS as RESULTS
 from ._schemes import (
@@ -35,7 +42,9 @@ from ._schemes import (
     EnergyConsistent as EnergyConsistent,
     EnergyDecaying as EnergyDecaying,
     EnergyPreserving as EnergyPreserving,
+    GeneralizedAlpha as GeneralizedAlpha,
     KappaDecaying as KappaDecaying,
+    Rattle as Rattle,
 )
 from ._simulate import simulate as simulate
 from ._solution import Solution as Solution, Statistics as Statistics

@@ -19,7 +19,7 @@ from ._newton import max_norm
 from ._results import first_failure, first_of, from_root_finder, RESULTS
 from ._root import find_root, RootFinder
 from ._scaling import scales_like
-from ._schemes import AbstractSingleSolve, StepEnd
+from ._schemes import AbstractCarryingSolve, AbstractSingleSolve, StepEnd
 from ._system import State
 from ._types import Count, Flag, Multipliers, Scalar, Velocities
 
@@ -37,11 +37,13 @@ class Memory(eqx.Module):
     - `is_smooth`: whether extrapolating from these would have met the last step better
       than repeating.
     - `factors`: of the Jacobian of the last step.
+    - `carried`: what a scheme with a memory hands on; of others `None`.
     """
 
     added: PyTree[Any]
     is_smooth: Flag
     factors: AbstractFactors | None
+    carried: PyTree[Any]
 
 
 def first_memory(
@@ -53,12 +55,30 @@ def first_memory(
     multipliers: Multipliers,
 ) -> Memory:
     """The memory of a run that begins."""
-    problem = scheme.problem(model, start, h)
+    carried = None
+    if isinstance(scheme, AbstractCarryingSolve):
+        carried = scheme.begin(model, start, h, acceleration)
+    problem = _problem(scheme, model, start, h, carried)
     z = scheme.predict(problem, acceleration, multipliers)
     flight = _free_flight(scheme, problem, model, start)
     added = jax.tree.map(lambda x, x0: jnp.stack([x - x0] * 3), z, flight)
     flat, _ = ravel_pytree(flight)
-    return Memory(added, jnp.array(True), kept_factors(flat.size, flat.dtype))
+    factors = kept_factors(flat.size, flat.dtype)
+    return Memory(added, jnp.array(True), factors, carried)
+
+
+def _problem(
+    scheme: AbstractSingleSolve,
+    model: AbstractModel,
+    start: State,
+    h: Scalar,
+    carried: PyTree[Any],
+) -> Any:
+    """The data of a step."""
+    problem = scheme.problem(model, start, h)
+    if isinstance(scheme, AbstractCarryingSolve):
+        return scheme.resume(problem, carried)
+    return problem
 
 
 def solve(
@@ -109,6 +129,7 @@ def solve(
             drive_work,
             jax.tree.map(lambda x: x[-1], ends.details),
             first_of(ends.result),
+            jax.tree.map(lambda x: x[-1], ends.carried),
         )
         return end, iterations + jnp.sum(counts), first_of(results), begin(state, h)
 
@@ -124,7 +145,7 @@ def _attempt(
     root_finder: RootFinder,
     skip: Flag,
 ) -> tuple[StepEnd, Count, RESULTS, Memory]:
-    problem = scheme.problem(model, start, h)
+    problem = _problem(scheme, model, start, h, memory.carried)
     flight = _free_flight(scheme, problem, model, start)
     unknown_scale, row_scale = scales_like(flight, model, start, h)
 
@@ -184,6 +205,7 @@ def _attempt(
         ),
         off(smooth) <= off(last),
         root.factors,
+        end.carried,
     )
     return end, root.iterations, result, memory
 

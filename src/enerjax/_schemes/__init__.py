@@ -1,4 +1,5 @@
 from .base import (
+    AbstractCarryingSolve as AbstractCarryingSolve,
     AbstractScheme as AbstractScheme,
     AbstractSingleSolve as AbstractSingleSolve,
     StepEnd as StepEnd,
@@ -8,4 +9,6 @@ from .composed import Composed as Composed
 from .energy_consistent import EnergyConsistent as EnergyConsistent
 from .energy_decaying import EnergyDecaying as EnergyDecaying
 from .energy_preserving import EnergyPreserving as EnergyPreserving
+from .generalized_alpha import GeneralizedAlpha as GeneralizedAlpha
 from .kappa_decaying import KappaDecaying as KappaDecaying
+from .rattle import Rattle as Rattle

@@ -123,6 +123,7 @@ class StepEnd(eqx.Module):
       system that has none.
     - `details`: what the scheme reports of its own, or `None`.
     - `result`: a failure that the scheme itself can see.
+    - `carried`: what a scheme with a memory hands to its next step; of others `None`.
     """
 
     state: State
@@ -133,6 +134,7 @@ class StepEnd(eqx.Module):
     drive_work: Scalar | None
     details: PyTree[Any]
     result: RESULTS
+    carried: PyTree[Any] = None
 
 
 class AbstractScheme(eqx.Module):
@@ -195,6 +197,24 @@ class AbstractSingleSolve(AbstractScheme, Generic[Z, P]):
     @abc.abstractmethod
     def finish(self, z: Z, problem: P) -> StepEnd:
         """The end of the step from the solved unknowns."""
+
+
+class AbstractCarryingSolve(AbstractSingleSolve[Z, P], Generic[Z, P]):
+    """A scheme that remembers more of the last step than the state at its end.
+
+    What it remembers travels beside the state, as `StepEnd.carried`, and is differentiated
+    like it. Such a scheme is no map from state to state, so it cannot be composed.
+    """
+
+    @abc.abstractmethod
+    def begin(
+        self, model: AbstractModel, start: State, h: Scalar, acceleration: Velocities
+    ) -> PyTree[Any]:
+        """What the first step of a run is handed."""
+
+    @abc.abstractmethod
+    def resume(self, problem: P, carried: PyTree[Any]) -> P:
+        """The data of a step, with what the step before has handed on."""
 
 
 def check_formulation(scheme: str, formulation: str) -> None:

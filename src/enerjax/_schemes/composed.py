@@ -7,8 +7,8 @@ class Composed(AbstractScheme):
     """A symmetric scheme raised to a higher order by steps of several lengths.
 
     A step is a palindrome of steps of lengths `stages[i] * h`, some of them backwards,
-    whose leading errors cancel. Every stage keeps the energy and the constraints, so the
-    composition does.
+    whose leading errors cancel. What every stage keeps, energy and constraints, the
+    composition keeps.
 
     - Conserves, constraints held at: as the composed scheme.
     - Order: `order`, 4, 6 or 8 (above that of the scheme).
@@ -21,7 +21,7 @@ class Composed(AbstractScheme):
 
     **Arguments:**
 
-    - `scheme`: `EnergyPreserving()` or `EnergyConsistent(0.0)`.
+    - `scheme`: `EnergyPreserving()` or `EnergyConsistent(0.0)`; `Rattle()` to compare.
     - `order`: 4, 6 or 8.
 
     Raises a `ValueError` for a scheme that is not symmetric (its backward stages would

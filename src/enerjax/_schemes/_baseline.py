@@ -1,0 +1,65 @@
+"""What the schemes that are here for comparison have in common."""
+
+import jax
+
+from .._discrete import ChainRule
+from .._model import AbstractModel, Increment, SeparableModel
+from .._system import State
+from .._types import Coordinates, Multipliers, Scalar
+from .base import Formulation, StepProblem
+
+
+def plain_problem(
+    scheme: str, model: AbstractModel, start: State, h: Scalar, formulation: Formulation
+) -> StepProblem:
+    """The data of a step; raises for a system that the scheme is not defined for."""
+    if isinstance(model, SeparableModel) and model.has_canonical_rates:
+        # No discrete gradient is taken.
+        return StepProblem(model, start, h, ChainRule(), formulation)
+    has = "varying inertia or a Hamiltonian"
+    if isinstance(model, SeparableModel):
+        has = "`kinematics`"
+    raise ValueError(
+        f"`{scheme}` needs constant inertia and velocities that are the rates of the "
+        f"coordinates, and this system has {has}. Use `EnergyPreserving` or "
+        "`EnergyDecaying`, or compare on points, directors (`bodies.RigidBody`) or planar "
+        "bodies."
+    )
+
+
+def model_of(problem: StepProblem) -> SeparableModel:
+    """The model, of which `plain_problem` knows the kind."""
+    assert isinstance(problem.model, SeparableModel)
+    return problem.model
+
+
+def reaction_force(
+    model: AbstractModel, q: Coordinates, t: Scalar | None, multipliers: Multipliers
+) -> Coordinates:
+    """`B(q, t)^T multipliers`"""
+    _, transpose = jax.vjp(lambda q: model.constraint(q, t), q)
+    return transpose(multipliers)[0]
+
+
+def measured_loss(
+    problem: StepProblem, end: State, work: Scalar | None, drive_work: Scalar | None
+) -> Scalar:
+    """The energy that is missing at the end, which no identity of the scheme explains."""
+    model, start = problem.model, problem.start
+    energy = lambda state: model.kinetic(state) + model.potential(state)
+    loss = energy(start) - energy(end)
+    for supplied in (work, drive_work):
+        loss = loss if supplied is None else loss + supplied
+    return loss
+
+
+def balance_rows(
+    problem: StepProblem, impulse: Coordinates, z: Increment, end: State
+) -> Increment:
+    """A balance of momentum, and the constraints at the end of the step."""
+    return Increment(
+        impulse,
+        z.momentum,
+        problem.model.constraint(end.q, end.t) / problem.h,
+        problem.joint_rate(end),
+    )

@@ -1,0 +1,159 @@
+"""Comparisons of schemes: errors, orders, what is refused, and the model for diffrax."""
+
+import functools
+import sys
+
+import jax
+import matplotlib
+import numpy as np
+import pytest
+
+import enerjax as ej
+
+from .helpers import problem
+from .references import double_pendulum_reference, HEAVY_TOP, point_on_rod
+
+
+SCHEMES = {"preserving": ej.EnergyPreserving(), "RATTLE": ej.Rattle()}
+STEPS = (80, 40)
+
+
+@functools.cache
+def orders():
+    return ej.order_table(problem("pendulum"), SCHEMES, STEPS, duration=1.0)
+
+
+@functools.cache
+def against_data():
+    times = np.array([0.25, 0.5, 0.75, 1.0])
+    exact = [point_on_rod(t) for t in times]
+    data = (times, np.array([x.q for x in exact]), np.array([x.v for x in exact]))
+    return ej.work_precision(
+        problem("pendulum"), SCHEMES, STEPS, data, duration=1.0, repeats=1
+    )
+
+
+def test_orders_of_the_pendulum():
+    table = orders()
+    assert table.steps == (40, 80)
+    np.testing.assert_allclose(table.h, [1 / 40, 1 / 80], rtol=1e-15)
+    assert table.expected == (2, 2)
+    np.testing.assert_allclose(table.order_q, 2, atol=0.1)
+    np.testing.assert_allclose(table.order_v, 2, atol=0.1)
+    # Both report the mean over the step, half a step before.
+    np.testing.assert_allclose(table.order_multipliers, 1, atol=0.1)
+
+
+def test_the_extrapolated_reference_is_as_good_as_given_data():
+    table, given = orders(), against_data()
+    assert max(table.uncertainty["q"], table.uncertainty["v"]) <= 1e-10
+    # Both know the motion to 1e-10, against errors of 4e-4.
+    np.testing.assert_allclose(table.q, given.q, rtol=1e-6)
+    np.testing.assert_allclose(table.v, given.v, rtol=1e-6)
+    np.testing.assert_allclose(table.multipliers, given.multipliers, rtol=1e-6)
+    assert given.uncertainty == dict(q=0.0, v=0.0, multipliers=0.0)
+
+
+def test_what_a_comparison_reports():
+    given = against_data()
+    for name in ("q", "v", "multipliers", "evaluations", "seconds"):
+        assert getattr(given, name).shape == (2, 2)
+        assert np.all(getattr(given, name) > 0)
+    # Solver; the energy of RATTLE is off by truncation, and by a quarter at half the step.
+    assert np.max(given.energy[0]) <= 1e-12
+    np.testing.assert_allclose(given.energy[1, 0] / given.energy[1, 1], 4, rtol=0.1)
+    assert np.max([given.constraint, given.constraint_rate]) <= 1e-12
+    text = str(given).splitlines()
+    assert len(text) == 2 + 4 + 1
+    assert text[0].split()[:4] == ["scheme", "h", "error", "q"]
+    assert text[-2].startswith("RATTLE")
+    assert "2.0" in str(orders())
+
+
+def test_pictures():
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    for measured in (orders(), against_data()):
+        figure = measured.plot()
+        assert [len(axes.lines) for axes in figure.axes] == [2, 2]
+        plt.close(figure)
+
+
+def test_failures_are_rows():
+    system, start, args = problem("double")
+    schemes = {"kappa": ej.KappaDecaying(0.5), "good": ej.EnergyPreserving()}
+    end = double_pendulum_reference(2.0)
+    comparison = ej.work_precision(
+        (system, start, args), schemes, [100], (2.0, end.q), duration=2.0, repeats=1
+    )
+    assert "failed at t = 1" in comparison.failures[0][0]
+    assert comparison.failures[1] == ("",)
+    assert np.isnan(comparison.q[0, 0])
+    assert comparison.q[1, 0] < 5e-3
+    assert np.isnan(comparison.v[1, 0])  # nothing was given to compare with
+    assert "kappa left (0, 2)" in str(comparison)
+
+
+def test_refusals_are_rows():
+    system, start, args = problem("top")
+    data = (0.1, np.concatenate([HEAVY_TOP[0.1].position, HEAVY_TOP[0.1].quaternion]))
+    table = ej.order_table(
+        (system, start, args), {"RATTLE": ej.Rattle()}, [10], data, duration=0.1
+    )
+    assert "refused: `Rattle` needs" in table.failures[0][0]
+    assert np.isnan(table.q).all()
+
+
+@pytest.mark.parametrize(
+    ("schemes", "steps", "reference", "message"),
+    [
+        (SCHEMES, [10], (0.123, [1.0, 0.0]), "does not pass t = 0.123"),
+        (SCHEMES, [10], (1.0, [1.0, 0.0, 0.0]), "has shape"),
+        (SCHEMES, [10], (1.0,), "must be a scheme, or data"),
+        (SCHEMES, [], None, "`steps` is empty"),
+        ([ej.Rattle()], [10], None, "dictionary"),
+    ],
+)
+def test_bad_input(schemes, steps, reference, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        ej.order_table(problem("pendulum"), schemes, steps, reference, duration=1.0)
+
+
+# The model for diffrax ------------------------------------------------------------------
+
+
+def _solved(diffrax, problem, duration):
+    term, y0 = ej.to_diffrax(*problem)
+    tight = diffrax.PIDController(rtol=1e-10, atol=1e-10)
+    solution = diffrax.diffeqsolve(
+        term, diffrax.Dopri8(), 0.0, duration, None, y0, stepsize_controller=tight
+    )
+    return term, jax.tree.map(lambda x: x[-1], solution.ys)
+
+
+def test_diffrax_on_the_double_pendulum():
+    diffrax = pytest.importorskip("diffrax")
+    system, start, args = problem("double")
+    term, y = _solved(diffrax, (system, start, args), 2.0)
+    exact = double_pendulum_reference(2.0)
+    # Its tolerance, and the growth of errors in two seconds.
+    np.testing.assert_allclose(y[0], exact.q, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(y[1], exact.v, rtol=0, atol=1e-8)
+    expected = ej.consistent_start(system, exact.q, exact.v, args).multipliers
+    found = term.vector_field.multipliers(2.0, y)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+
+
+def test_diffrax_on_a_body_that_rotates():
+    diffrax = pytest.importorskip("diffrax")
+    term, y = _solved(diffrax, problem("top"), 0.1)
+    state, exact = term.vector_field.state(0.1, y), HEAVY_TOP[0.1]
+    np.testing.assert_allclose(state.q[:3], exact.position, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(state.v[3:], exact.spin, rtol=0, atol=1e-6)
+
+
+def test_without_diffrax_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "diffrax", None)
+    with pytest.raises(ImportError, match=r"enerjax\[diffrax\]"):
+        ej.to_diffrax(*problem("pendulum"))
