@@ -171,12 +171,13 @@ def main(arguments: list[str] | None = None) -> None:
 
     begin = time.perf_counter()
     cases = [case for case in CASES if not options.quick or case.name in QUICK]
+    problems = [(case, case.problem()) for case in cases]
     levels = 2 if options.quick else 3
     found: dict[tuple[int, str], list[Row]] = {}
     with ThreadPoolExecutor(2) as pool:
         futures = {
-            pool.submit(measure, case, case.problem(), name, levels): (k, name)
-            for k, case in enumerate(cases)
+            pool.submit(measure, case, problem, name, levels): (k, name)
+            for k, (case, problem) in enumerate(problems)
             for name in SCHEMES
         }
         for future in as_completed(futures):

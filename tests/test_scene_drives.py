@@ -131,7 +131,13 @@ def test_drives_lead_points_along_their_paths():
     assert np.max(np.abs(leak)) <= 1e-11
 
 
-@pytest.mark.parametrize("body", [ej.bodies.RigidBody, ej.bodies.QuaternionBody])
+@pytest.mark.parametrize(
+    "body",
+    [
+        ej.bodies.RigidBody,
+        pytest.param(ej.bodies.QuaternionBody, marks=pytest.mark.slow),
+    ],
+)
 def test_a_hinge_in_space_is_driven_over_full_turns(body):
     axis = np.array([0.0, 0.6, 0.8])
     scene = ej.Scene(
