@@ -37,7 +37,8 @@ def _data(name: str, num_positions: int) -> Callable[[], Published]:
     def rows() -> Published:
         path = Path(__file__).parent / "data" / "mechanisms.json"
         table = np.array(json.loads(path.read_text())[name]["rows"])
-        return [(row[0], *np.split(row[1:], [num_positions])) for row in table]
+        last = 1 + num_positions
+        return [(row[0], row[1:last], row[last:]) for row in table]
 
     return rows
 

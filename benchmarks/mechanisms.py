@@ -183,7 +183,9 @@ def main(arguments: list[str] | None = None) -> None:
         for future in as_completed(futures):
             k, name = futures[future]
             found[k, name] = future.result()
-            print(f"{cases[k].name}, {name}", file=sys.stderr, flush=True)
+            last = found[k, name][-1]
+            message = f"{last.problem}, {name}: {last.error_q:.1e}, {last.order_q:.2f}"
+            print(message, file=sys.stderr, flush=True)
     rows = [row for k in range(len(cases)) for name in SCHEMES for row in found[k, name]]
     show(rows)
     write_csv(rows, options.out / "mechanisms.csv")

@@ -32,7 +32,7 @@ def steady_top(precession: Real = 10.0) -> Problem:
         mass,
         [across, across, axial],
         centre * axis,
-        [[1, 0, 0], [0, c, -s], [0, s, c]],
+        np.array([[1, 0, 0], [0, c, -s], [0, s, c]]),
         velocity=jnp.cross(turning, centre * axis),
         angular_velocity=turning,
     )
