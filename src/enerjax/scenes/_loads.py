@@ -25,7 +25,9 @@ class Damper(AbstractForce):
     """A viscous damper between two points, along their line: `-damping * rdot`.
 
     Points that are not given are the origins of the frames; they must not meet.
-    `damping` is a force per velocity and not negative.
+    `damping` is a force per velocity and not negative. It takes energy out in every step,
+    however long, with `EnergyPreserving` and `EnergyConsistent`; with the decaying schemes
+    this is certain only where the line keeps its direction.
     """
 
     name: str
