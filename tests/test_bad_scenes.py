@@ -9,6 +9,9 @@ Point, Rod = ej.bodies.PointMass, ej.bodies.PlanarBody.rod
 Body, Revolute = ej.bodies.RigidBody, ej.joints.Revolute
 ROD = Rod("rod", 1.0, [0.0, 0.0], [1.0, 0.0])
 BOX = lambda name="box", **more: Body(name, 1.0, [0.1, 0.1, 0.1], [0.0, 0, 0], **more)
+MOTOR = lambda body, **more: ej.drives.Angle(
+    "motor", "ground", body, lambda t, args: 2.0 * t, **more
+)
 BAD = {
     "no body": (lambda: [Revolute("pin", "rod", "rdo"), ROD], "'pin'.*no such body"),
     "mass": (lambda: [Point("dot", 0.0, [0.0, 0.0])], "`mass` of 'dot' must be positive"),
@@ -37,7 +40,36 @@ BAD = {
     ),
     "axis": (lambda: [BOX(), Revolute("pin", "ground", "box")], "'pin' needs `axis`"),
     "shape": (lambda: [Point("dot", 1.0, [0.0])], "`position` of 'dot' must be"),
-    "stranger": (lambda: [ROD, "pin"], "made of bodies, joints and forces"),
+    "driven body": (lambda: [ROD, MOTOR("rdo")], "'motor' connects 'rdo'.*no such body"),
+    "driven point": (
+        lambda: [Point("dot", 1.0, [0.0, 0.0]), MOTOR("dot")],
+        "'motor' needs the orientation of 'dot'",
+    ),
+    "not connected": (
+        lambda: [BOX(), MOTOR("box", axis=[0.0, 0.0, 1.0])],
+        "'motor' has an angle only with a joint.*none connects 'ground' and 'box'",
+    ),
+    "no motion": (
+        lambda: [ROD, ej.drives.Angle("motor", "ground", "rod", 3.0)],  # type: ignore
+        "`motion` of 'motor' must be a function of",
+    ),
+    "shape of motion": (
+        lambda: [ROD, ej.drives.Position("lead", "rod", lambda t, args: t)],
+        "function of 'lead' must return shape",
+    ),
+    "shape of load": (
+        lambda: [ROD, ej.forces.Load("wind", "rod", lambda t, args: t)],
+        "function of 'wind' must return shape",
+    ),
+    "far from the drive": (
+        lambda: [ROD, ej.drives.Distance("ram", "ground", "rod", lambda t, args: 2.0 + t)],
+        "'ram' is off by",
+    ),
+    "damping": (
+        lambda: [ROD, ej.forces.Damper("damper", "ground", "rod", -1.0)],
+        "`damping` of 'damper' must not be below 0",
+    ),
+    "stranger": (lambda: [ROD, "pin"], "made of bodies, joints, forces and drives"),
 }  # fmt: skip
 
 
@@ -58,3 +90,9 @@ def test_a_joint_that_repeats_others_is_named():
     again = ej.joints.Distance("again", "ground", "inner")
     with pytest.raises(ValueError, match="'again' repeats"):
         ej.Scene([*PENDULUM, again]).start()
+
+
+def test_a_drive_of_what_is_held_already_is_named():
+    ram = ej.drives.Distance("ram", "ground", "inner", lambda t, args: 1.0 + 0.0 * t)
+    with pytest.raises(ValueError, match="'ram' repeats"):
+        ej.Scene([*PENDULUM, ram]).start()

@@ -57,6 +57,7 @@ from ._system import (
 )
 from .scenes import (
     bodies as bodies,
+    drives as drives,
     forces as forces,
     Gap as Gap,
     joints as joints,

@@ -35,6 +35,7 @@ from ._rigid_bodies import (
     heavy_top_canonical as heavy_top_canonical,
     heavy_top_directors as heavy_top_directors,
 )
+from ._spatial import steady_top as steady_top, tethered_body as tethered_body
 from ._springs import (
     elastic_pendulum as elastic_pendulum,
     four_particles as four_particles,

@@ -3,6 +3,7 @@ from typing import NamedTuple
 from .._initial import initial_state
 from .._system import AbstractSystem, State
 from .._types import Args, Vector
+from ..scenes import Scene
 
 
 class Problem(NamedTuple):
@@ -18,3 +19,7 @@ class Problem(NamedTuple):
 
 def problem(system: AbstractSystem, q: Vector, v: Vector, args: Args) -> Problem:
     return Problem(system, initial_state(system, q, v, args), args)
+
+
+def made(scene: Scene) -> Problem:
+    return Problem(*scene.build())

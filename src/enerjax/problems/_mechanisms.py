@@ -7,11 +7,7 @@ import numpy as np
 
 from .._types import Real
 from ..scenes import bodies, forces, joints, Scene
-from ._base import Problem
-
-
-def _made(scene: Scene) -> Problem:
-    return Problem(*scene.build())
+from ._base import made, Problem
 
 
 _EARTH = (0.0, -9.81)
@@ -24,7 +20,7 @@ def point_pendulum(g: Real = 9.81) -> Problem:
     """
     point = bodies.PointMass("point", 1.0, [-1.0, 0.0])
     rod = joints.Distance("rod", "ground", "point")
-    return _made(Scene([point, rod], gravity=jnp.array([0.0, -1.0]) * g))
+    return made(Scene([point, rod], gravity=jnp.array([0.0, -1.0]) * g))
 
 
 def slider_crank(
@@ -46,7 +42,7 @@ def slider_crank(
         joints.Revolute("small end", "slider", "rod", [0.0, 0.0]),
         joints.Prismatic("guide", "ground", "slider", axis=[1.0, 0.0]),
     ]
-    return _made(Scene(parts, gravity=_EARTH))
+    return made(Scene(parts, gravity=_EARTH))
 
 
 def four_bar(
@@ -68,7 +64,7 @@ def four_bar(
         joints.Revolute("C", "coupler", "rocker", [coupler / 2, 0.0]),
         joints.Revolute("D", "ground", "rocker", base),
     ]
-    return _made(Scene(parts, gravity=_EARTH))
+    return made(Scene(parts, gravity=_EARTH))
 
 
 def parallel_bars(num_cells: int = 2, speed: Real = 1.0) -> Problem:
@@ -96,7 +92,7 @@ def parallel_bars(num_cells: int = 2, speed: Real = 1.0) -> Problem:
                 rod(level, 1.0, [k, 1], [k + 1, 1], moving),
                 joints.Revolute(f"left {k + 1}", upright, level, top, foot),
             ]
-    return _made(Scene(parts, gravity=_EARTH))
+    return made(Scene(parts, gravity=_EARTH))
 
 
 # Andrews' mechanism, in the names of the source. Of each body: mass, inertia, angle, the
@@ -153,7 +149,7 @@ def squeezer(torque: Real = 0.033) -> Problem:
         forces.Spring("spring", "ground", "K3", 4530.0, 0.07785, [0.014, 0.072], hook),
         forces.ConstantTorque("motor", "K1", torque),
     ]
-    return _made(Scene(parts))
+    return made(Scene(parts))
 
 
 def _turned(angle: float, x: Sequence[float] | np.ndarray) -> np.ndarray:
@@ -182,4 +178,4 @@ def spatial_four_bar(speed: Real = 20.0) -> Problem:
         joints.Spherical("C", "rocker", "coupler", [0.0, 0.0, 0.25]),
         joints.Revolute("D", "ground", "rocker", base, axis=axis_d),
     ]
-    return _made(Scene(parts, gravity=(0.0, 0.0, -9.81)))
+    return made(Scene(parts, gravity=(0.0, 0.0, -9.81)))

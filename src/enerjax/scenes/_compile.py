@@ -18,19 +18,24 @@ from ._parameters import Parameters
 from ._start import Ends
 from ._view import View
 from .bodies import AbstractBody
+from .drives import AbstractDrive
 from .forces import AbstractForce, Potential
 from .joints import AbstractJoint, Constraint
 
 
 def sort_parts(parts: Sequence[Any]) -> dict[type, list[Any]]:
     """The parts by what they are, if names and plane or space fit together."""
-    kinds = (AbstractBody, AbstractJoint, AbstractForce, Constraint, Potential)
+    kinds = (
+        AbstractBody, AbstractJoint, AbstractForce, AbstractDrive, Constraint, Potential,
+    )  # fmt: skip
     found: dict[type, list[Any]] = {kind: [] for kind in kinds}
     names = {GROUND}
     for part in parts:
         kind = next((kind for kind in kinds if isinstance(part, kind)), None)
         if kind is None:
-            raise TypeError(f"A scene is made of bodies, joints and forces, got {part!r}.")
+            raise TypeError(
+                f"A scene is made of bodies, joints, forces and drives, got {part!r}."
+            )
         if not isinstance(part.name, str):
             raise TypeError(f"A name must be a string, got {part.name!r}.")
         if part.name in names:
@@ -60,10 +65,11 @@ def compile_parts(
     bodies = found[AbstractBody]
     named = tuple((body.name, body.kind) for body in bodies)
     rows = numbers_of(named)
-    ends = _StartPose(bodies, rows)
+    joined = {frozenset((joint.a, joint.b)) for joint in found[AbstractJoint]}
+    ends = _StartPose(bodies, rows, joined)
     resolved = {
         kind: [(part, *part.resolve(ends(part))) for part in found[kind]]
-        for kind in (AbstractJoint, AbstractForce)
+        for kind in (AbstractJoint, AbstractForce, AbstractDrive)
     }
     links = {
         kind: tuple(
@@ -79,11 +85,13 @@ def compile_parts(
         constraints=tuple((part.name, part.function) for part in found[Constraint]),
         potentials=tuple((part.name, part.function) for part in found[Potential]),
         has_gravity=gravity is not None,
+        drives=links[AbstractDrive],
     )
     tables = dict(
         bodies=_tables(layout.body_groups, {b.name: b.numbers for b in bodies}),
         joints=_tables(layout.joint_groups, _by_name(resolved[AbstractJoint])),
         forces=_tables(layout.force_groups, _by_name(resolved[AbstractForce])),
+        drives=_tables(layout.drive_groups, _by_name(resolved[AbstractDrive])),
     )
     return layout, Parameters(tables, _own(own, gravity, layout, tables), layout)
 
@@ -120,10 +128,15 @@ def _tables(groups: Sequence[Any], numbers: dict[str, Numbers]) -> tuple[Numbers
 class _StartPose:
     """Finds the bodies that a part connects, as they start."""
 
-    def __init__(self, bodies: Sequence[AbstractBody], rows: dict[str, int]):
+    def __init__(
+        self,
+        bodies: Sequence[AbstractBody],
+        rows: dict[str, int],
+        joined: set[frozenset[str]],
+    ):
         kinds = tuple((body.name, body.kind) for body in bodies)
         self._layout = Layout(bodies[0].kind.dimension, kinds, (), (), (), (), False)
-        self._rows = rows
+        self._rows, self._joined = rows, joined
         q = join([body.q for body in bodies])
         frames = _all_frames(self._layout, jnp.asarray(q))
         self._frames = jax.device_get(frames) if is_known(frames) else frames
@@ -140,7 +153,10 @@ class _StartPose:
         numbers = self._rows[part.a], self._rows[part.b]
         a, b = (jax.tree.map(lambda x, k=k: x[k], self._frames) for k in numbers)
         turns = [k == 0 or bool(self._layout.turning[k]) for k in numbers]
-        return Ends(f"'{part.name}'", (part.a, part.b), (a, b), (turns[0], turns[1]))
+        joined = frozenset((part.a, part.b)) in self._joined
+        return Ends(
+            f"'{part.name}'", (part.a, part.b), (a, b), (turns[0], turns[1]), joined
+        )
 
 
 @eqx.filter_jit

@@ -1,9 +1,7 @@
 """The functions of `System` that a scene compiles to.
 
 All parts of a kind are evaluated at once, over tables of their numbers; parts that a scene
-does not have leave no trace. A force that is no potential, or a constraint that is driven,
-is one more function here: a law of frames (and their rates), summed or concatenated over
-its groups like the others.
+does not have leave no trace.
 """
 
 import equinox as eqx
@@ -14,6 +12,7 @@ from jaxtyping import Array, Float
 
 from .._system import System
 from .._types import Coordinates, Multipliers, Scalar, Velocities
+from ._laws import AbstractPush, Driven
 from ._layout import Layout, Links
 from ._parameters import Parameters
 from ._view import rows, View
@@ -21,15 +20,15 @@ from ._view import rows, View
 
 def make_system(layout: Layout) -> System:
     """The system of a scene; its `args` are `Parameters`."""
-    kinds = [group.kind for group in layout.body_groups]
-    joined = layout.joints or layout.constraints or any(k.num_internal for k in kinds)
-    redundant = any(kind.num_redundant for kind in kinds)
+    redundant = any(group.kind.num_redundant for group in layout.body_groups)
     return System(
         eqx.Partial(kinetic, layout),
         eqx.Partial(potential, layout),
-        eqx.Partial(constraint, layout) if joined else None,
+        eqx.Partial(constraint, layout) if layout.has_constraints else None,
         kinematics=eqx.Partial(velocity_map, layout) if redundant else None,
         coordinate_constraint=eqx.Partial(redundancy, layout) if redundant else None,
+        force=eqx.Partial(force, layout) if layout.has_pushes else None,
+        driven=eqx.Partial(driven, layout) if layout.drives else None,
     )
 
 
@@ -47,7 +46,8 @@ def potential(layout: Layout, q: Coordinates, args: Parameters) -> Scalar:
     if layout.has_gravity:
         energy = energy - _weight(view, args)
     for group, numbers in zip(layout.force_groups, args.tables["forces"], strict=True):
-        energy = energy + jnp.sum(evaluate(group, view, numbers))
+        if not isinstance(group.law, AbstractPush):
+            energy = energy + jnp.sum(evaluate(group, view, numbers))
     for _, function in layout.potentials:
         energy = energy + function(view, args)
     return energy
@@ -79,8 +79,79 @@ def constraint(layout: Layout, q: Coordinates, args: Parameters) -> Multipliers:
     return jnp.concatenate(parts)
 
 
+def driven(layout: Layout, q: Coordinates, t: Scalar, args: Parameters) -> Multipliers:
+    view = View(layout, q)
+    parts = [
+        evaluate(group, view, numbers).reshape(-1)
+        for group, numbers in drives_at(layout, t, args)
+    ]
+    return jnp.concatenate(parts)
+
+
+def drives_at(
+    layout: Layout, t: Scalar, args: Parameters
+) -> list[tuple[Links, dict[str, Array]]]:
+    """All drives, with the values that they prescribe now among their numbers."""
+    groups = zip(layout.drive_groups, args.tables["drives"], strict=True)
+    return [(group, _now(group, numbers, t, args)) for group, numbers in groups]
+
+
+def _now(
+    group: Links, numbers: dict[str, Array], t: Scalar, args: Parameters
+) -> dict[str, Array]:
+    """With the value of the signal, if there is one: the same for all links."""
+    assert isinstance(group.law, AbstractPush | Driven)
+    if group.law.signal is None:
+        return numbers
+    value = jnp.asarray(group.law.signal(t, args)).astype(t.dtype)
+    wanted = (args.layout.dimension,) if group.law.measure.is_vector else ()
+    if value.shape != wanted:
+        raise ValueError(
+            f"The function of '{group.names[0]}' must return "
+            f"{f'shape {wanted}' if wanted else 'a scalar'}, got shape {value.shape}."
+        )
+    return numbers | dict(value=jnp.broadcast_to(value, (len(group.names), *wanted)))
+
+
+def force(
+    layout: Layout, q: Coordinates, v: Velocities, t: Scalar, args: Parameters
+) -> Velocities:
+    view = View(layout, q)
+    groups = [
+        (group, _now(group, numbers, t, args))
+        for group, numbers in zip(layout.force_groups, args.tables["forces"], strict=True)
+        if isinstance(group.law, AbstractPush)
+    ]
+
+    def measures(x: Coordinates) -> list[Array]:
+        return [evaluate(group, View(layout, x), numbers) for group, numbers in groups]
+
+    def rates(v: Velocities) -> list[Array]:
+        return jax.jvp(measures, (q,), (lift(layout, q, v),))[1]
+
+    now, pull = jax.vjp(rates, v)
+    return pull([_pushes(*pair, view, x) for pair, x in zip(groups, now, strict=True)])[0]
+
+
+def _pushes(group: Links, numbers: dict[str, Array], view: View, rate: Array) -> Array:
+    assert isinstance(group.law, AbstractPush)
+    frames = view.frames(group.b, group.law.reads)
+    return jax.vmap(group.law.push)(frames, rate, numbers)
+
+
+def lift(layout: Layout, q: Coordinates, v: Velocities) -> Coordinates:
+    """The rates of the coordinates."""
+    if not any(group.kind.num_redundant for group in layout.body_groups):
+        return v
+    rates = jnp.zeros_like(q)
+    for group in layout.body_groups:
+        lifted = jax.vmap(group.kind.lift)(rows(q, group.q), rows(v, group.v))
+        rates = rates.at[group.q].set(lifted)
+    return rates
+
+
 def evaluate(group: Links, view: View, numbers: dict[str, Array]) -> Array:
-    """The rows or energies of all links of a law, one row each."""
+    """What a law says of all its links, one row each."""
     a, b = (view.frames(bodies, group.law.reads) for bodies in (group.a, group.b))
     return jax.vmap(group.law)(a, b, numbers)
 

@@ -9,27 +9,14 @@ momenta of these to round-off.
 import abc
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, TypeAlias
 
 import jax.numpy as jnp
+from jaxtyping import Array
 
-from .._types import Multipliers, Scalar
+from .._types import Args, Multipliers, Scalar
 from ._frames import Frame, Numbers, Point
-
-
-class AbstractLaw(abc.ABC):
-    """A function of the frames of two bodies; `reads` are the fields of a frame in use."""
-
-    reads: ClassVar[tuple[str, ...]] = ("origin", "axes")
-
-    @abc.abstractmethod
-    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Any:
-        """Rows that vanish, of a joint; an energy, of a force."""
-
-
-def offset(a: Frame, b: Frame, numbers: Numbers) -> Point:
-    """From the point on the first body to the one on the second."""
-    return b.point(numbers["point_b"]) - a.point(numbers["point_a"])
+from ._measures import AbstractLaw, AbstractMeasure, offset, PlanarTurn, Separation, Turn
 
 
 @dataclass(frozen=True)
@@ -80,7 +67,7 @@ class Curve(AbstractLaw):
 @dataclass(frozen=True)
 class SpringEnergy(AbstractLaw):
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Scalar:
-        length = jnp.sqrt(jnp.sum(offset(a, b, numbers) ** 2))
+        length = Separation()(a, b, numbers)
         return 0.5 * numbers["stiffness"] * (length - numbers["length"]) ** 2
 
 
@@ -89,7 +76,8 @@ class PlanarTorsion(AbstractLaw):
     reads = ("angle",)
 
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Scalar:
-        return 0.5 * numbers["stiffness"] * (b.angle - a.angle - numbers["angle"]) ** 2
+        turn = PlanarTurn()(a, b, numbers)
+        return 0.5 * numbers["stiffness"] * (turn - numbers["angle"]) ** 2
 
 
 @dataclass(frozen=True)
@@ -97,10 +85,8 @@ class Torsion(AbstractLaw):
     reads = ("axes",)
 
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Scalar:
-        x, y = (a.direction(numbers["frame_a"][k]) for k in (0, 1))
-        turned = b.direction(numbers["frame_b"][0])
-        angle = jnp.arctan2(jnp.sum(turned * y), jnp.sum(turned * x))
-        return 0.5 * numbers["stiffness"] * (angle - numbers["angle"]) ** 2
+        turn = Turn()(a, b, numbers)
+        return 0.5 * numbers["stiffness"] * (turn - numbers["angle"]) ** 2
 
 
 @dataclass(frozen=True)
@@ -115,3 +101,70 @@ class PlanarTwist(AbstractLaw):
 
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Scalar:
         return -numbers["torque"] * (b.angle - a.angle)
+
+
+# Laws that time or velocities enter -----------------------------------------------------
+
+# A function of time and of the `args` of the system.
+Signal: TypeAlias = Callable[[Scalar, Args], Array]
+
+
+@dataclass(frozen=True)
+class Driven(AbstractLaw):
+    """A measure that is held at a value of the time, which `numbers["value"]` is now."""
+
+    measure: AbstractMeasure
+    signal: Signal
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return self.measure.reads
+
+    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Multipliers:
+        return self.measure.away(a, b, numbers, numbers["value"])
+
+
+class AbstractPush(AbstractLaw):
+    """A force along a measure, that no potential has."""
+
+    measure: AbstractMeasure
+    signal: Signal | None
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return self.measure.reads
+
+    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Any:
+        return self.measure(a, b, numbers)
+
+    @abc.abstractmethod
+    def push(self, b: Frame, rate: Array, numbers: Numbers) -> Array:
+        """The force, for the rate of the measure."""
+
+
+@dataclass(frozen=True)
+class Viscous(AbstractPush):
+    measure: AbstractMeasure
+    signal: None = None
+
+    def push(self, b: Frame, rate: Array, numbers: Numbers) -> Array:
+        return -numbers["damping"] * rate
+
+
+@dataclass(frozen=True)
+class Acting(AbstractPush):
+    """A force that is `numbers["value"]` now."""
+
+    measure: AbstractMeasure
+    signal: Signal
+
+    def push(self, b: Frame, rate: Array, numbers: Numbers) -> Array:
+        return numbers["value"]
+
+
+@dataclass(frozen=True)
+class Following(Acting):
+    """A force that is told in the axes of its body."""
+
+    def push(self, b: Frame, rate: Array, numbers: Numbers) -> Array:
+        return b.direction(numbers["value"])

@@ -9,11 +9,12 @@ import numpy as np
 
 from ._frames import GROUND
 from ._kinds import AbstractKind
-from ._laws import AbstractLaw
+from ._laws import AbstractPush
+from ._measures import AbstractLaw
 
 
 class Link(NamedTuple):
-    """A joint or force: its law, and the numbers of its bodies; the ground is 0."""
+    """A joint, drive or force: its law, and the numbers of its bodies; the ground is 0."""
 
     name: str
     law: AbstractLaw
@@ -31,7 +32,7 @@ class Bodies(NamedTuple):
 
 
 class Links(NamedTuple):
-    """All joints or forces of a law."""
+    """All joints, drives or forces of a law."""
 
     law: AbstractLaw
     names: tuple[str, ...]
@@ -54,6 +55,7 @@ class Layout:
     constraints: tuple[tuple[str, Callable], ...]
     potentials: tuple[tuple[str, Callable], ...]
     has_gravity: bool
+    drives: tuple[Link, ...] = ()
 
     @cached_property
     def body_groups(self) -> tuple[Bodies, ...]:
@@ -89,10 +91,26 @@ class Layout:
         return _links(self.forces)
 
     @cached_property
+    def drive_groups(self) -> tuple[Links, ...]:
+        return _links(self.drives)
+
+    @property
+    def has_constraints(self) -> bool:
+        internal = any(group.kind.num_internal for group in self.body_groups)
+        return bool(self.joints or self.constraints or internal)
+
+    @property
+    def has_pushes(self) -> bool:
+        return any(isinstance(link.law, AbstractPush) for link in self.forces)
+
+    @cached_property
     def places(self) -> dict[str, dict[str, tuple[int, int]]]:
         """Group and row of every part, section by section."""
         sections = dict(
-            bodies=self.body_groups, joints=self.joint_groups, forces=self.force_groups
+            bodies=self.body_groups,
+            joints=self.joint_groups,
+            forces=self.force_groups,
+            drives=self.drive_groups,
         )
         return {
             section: {

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from .._types import Coordinates, Scalar
 from ._frames import Frame, Numbers, Point
-from ._functions import constraint, evaluate, redundancy
+from ._functions import constraint, driven, drives_at, evaluate, redundancy
 from ._layout import Layout, Links
 from ._parameters import Parameters
 from ._view import View
@@ -33,12 +33,13 @@ def moved(frame: Frame, pivot: Point, shift: Point, turn: Array) -> Frame:
     else:
         rotated = lambda x: jnp.cross(turn, x)
     origin = frame.origin + shift + rotated(frame.origin - pivot)
-    return Frame(origin, frame.axes + jax.vmap(rotated)(frame.axes), frame.angle)
+    angle = frame.angle + turn[0] if pivot.size == 2 else frame.angle
+    return Frame(origin, frame.axes + jax.vmap(rotated)(frame.axes), angle)
 
 
 def pivot_of(frame: Frame, numbers: Numbers) -> Point:
-    """The point of the second body that a joint holds."""
-    return frame.point(numbers["point_b"])
+    """The point of the second body that a joint holds; its origin, of an angle."""
+    return frame.point(numbers["point_b"]) if "point_b" in numbers else frame.origin
 
 
 def still(dimension: int, dtype: Any) -> tuple[Array, Array]:
@@ -50,24 +51,39 @@ def still(dimension: int, dtype: Any) -> tuple[Array, Array]:
 def gaps(
     layout: Layout, q: Coordinates, qdot: Coordinates, args: Parameters
 ) -> tuple[list[tuple[Array, Array]], Scalar]:
-    """For every group of joints how far each is off, and its rate; the scene's size."""
+    """For every group of joints how far each is off, and its rate; the scene's size.
+
+    Joints come first, constraints next, drives last.
+    """
     view = View(layout, q)
     size = _size(view, args)
-    found = []
+    found, of_drives = [], []
     for group, numbers in zip(layout.joint_groups, args.tables["joints"], strict=True):
-        rates = lambda x, group=group, numbers=numbers: evaluate(
+        rows = lambda x, group=group, numbers=numbers: evaluate(
             group, View(layout, x), numbers
         )
-        value, rate = jax.jvp(rates, (q,), (qdot,))
-        slope = _slopes(group, view, numbers, size)
-        measure = lambda x, slope=slope: jnp.linalg.norm(x / slope, axis=1)
-        found.append((measure(value), measure(rate)))
+        pair = jax.jvp(rows, (q,), (qdot,))
+        found.append(_lengths(pair, _slopes(group, view, numbers, size)))
+    t = jnp.zeros((), q.dtype)
+    for k, (group, numbers) in enumerate(drives_at(layout, t, args)):
+
+        def driven_rows(x: Coordinates, t: Scalar, k: int = k) -> Array:
+            group, numbers = drives_at(layout, t, args)[k]
+            return evaluate(group, View(layout, x), numbers)
+
+        pair = jax.jvp(driven_rows, (q, t), (qdot, jnp.ones_like(t)))
+        of_drives.append(_lengths(pair, _slopes(group, view, numbers, size)))
     for _, function in layout.constraints:
         of_q = lambda x, function=function: function(View(layout, x), args)
         value, rate = jax.jvp(of_q, (q,), (qdot,))
         slope = jnp.linalg.norm(jax.jacfwd(of_q)(q), axis=1)
         found.append(tuple(jnp.linalg.norm(x / slope)[None] for x in (value, rate)))
-    return found, size
+    return found + of_drives, size
+
+
+def _lengths(pair: tuple[Array, Array], slope: Array) -> tuple[Array, Array]:
+    value, rate = (jnp.linalg.norm(x / slope, axis=1) for x in pair)
+    return value, rate
 
 
 def _slopes(
@@ -82,7 +98,9 @@ def _slopes(
         shift, turn = jax.jacfwd(rows, argnums=(0, 1))(*rest)
         return jnp.linalg.norm(jnp.concatenate([shift, turn / size], axis=1), axis=1)
 
-    a, b = (Frame(view.origins[k], view.axes[k]) for k in (group.a, group.b))
+    a, b = (
+        Frame(view.origins[k], view.axes[k], view.angles[k]) for k in (group.a, group.b)
+    )
     slopes = jax.vmap(slope)(a, b, numbers)
     return jnp.where(slopes > 0, slopes, 1)
 
@@ -117,12 +135,18 @@ def first_dependent(
     layout: Layout, q: Coordinates, args: Parameters, places: dict[str, slice]
 ) -> str | None:
     """The first joint with a row that those before it determine already."""
-    joints = jax.jacfwd(lambda x: constraint(layout, x, args))(q)
-    redundant = jax.jacfwd(lambda x: redundancy(layout, x, args))(q)
-    joined = sum(place.stop - place.start for place in places.values())
-    taken = [*joints[joined:], *redundant]  # what bodies have of their own comes last
+    start = jnp.zeros((), q.dtype)
+    held = []
+    if layout.has_constraints:
+        held += [*jax.jacfwd(lambda x: constraint(layout, x, args))(q)]
+    if layout.drives:
+        held += [*jax.jacfwd(lambda x: driven(layout, x, start, args))(q)]
+    joined = {k for place in places.values() for k in range(place.start, place.stop)}
+    # What bodies have of their own stands before.
+    taken = [row for k, row in enumerate(held) if k not in joined]
+    taken += [*jax.jacfwd(lambda x: redundancy(layout, x, args))(q)]
     for name, place in places.items():
-        taken += [*joints[place]]
+        taken += held[place]
         if np.linalg.matrix_rank(np.array(taken)) < len(taken):
             return name
     return None

@@ -14,8 +14,14 @@ def module_of(*values: Any) -> ModuleType:
     return np if is_known(values) else jnp
 
 
-def number(part: str, role: str, value: Any, *shapes: tuple[int, ...]) -> Any:
-    """`value` as an array of floats of one of the shapes."""
+def number(
+    part: str,
+    role: str,
+    value: Any,
+    *shapes: tuple[int, ...],
+    least: float | None = None,
+) -> Any:
+    """`value` as an array of floats of one of the shapes, none below `least`."""
     known = is_known(value)
     try:
         array = np.asarray(value, float) if known else jnp.asarray(value)
@@ -26,7 +32,18 @@ def number(part: str, role: str, value: Any, *shapes: tuple[int, ...]) -> Any:
         raise ValueError(f"{role} of {part} must be {wanted}, got shape {array.shape}.")
     if known and not np.all(np.isfinite(array)):
         raise ValueError(f"{role} of {part} is not finite: {value}.")
+    if known and least is not None and np.any(array < least):
+        raise ValueError(f"{role} of {part} must not be below {least:g}, got {value}.")
     return array
+
+
+def check_signal(part: str, role: str, value: Any) -> None:
+    """Raises for what is no function of time."""
+    if not callable(value):
+        raise TypeError(
+            f"`{role}` of '{part}' must be a function of (t, args), got "
+            f"{type(value).__name__}."
+        )
 
 
 def positive(part: str, role: str, value: Any) -> Any:

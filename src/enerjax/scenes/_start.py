@@ -13,12 +13,14 @@ class Ends(NamedTuple):
     - `part`, `bodies`: names, for messages.
     - `frames`: with all fields that the plane or space has.
     - `turns`: whether each has an orientation; the ground counts as one that has.
+    - `joined`: whether a joint connects them.
     """
 
     part: str
     bodies: tuple[str, str]
     frames: tuple[Frame, Frame]
     turns: tuple[bool, bool]
+    joined: bool = False
 
     @property
     def dimension(self) -> int:
@@ -41,17 +43,17 @@ class Ends(NamedTuple):
 
     def axes(self, axis_a: Any, axis_b: Any = None) -> Numbers:
         """The axes of the joint in both bodies, as rows; see `basis`."""
-        for body, turns in zip(self.bodies, self.turns, strict=True):
-            if not turns:
-                raise ValueError(
-                    f"{self.part} needs the orientation of '{body}', and a point mass has "
-                    "none."
-                )
+        self.only_bodies_that_turn()
         a, b = self.frames
         of_a = basis(self._axis("`axis`", axis_a))
         if axis_b is None:
             return dict(frame_a=of_a, frame_b=of_a @ a.axes @ b.axes.T)
         return dict(frame_a=of_a, frame_b=basis(self._axis("`axis_b`", axis_b)))
+
+    def first_axes(self, axis_a: Any) -> Numbers:
+        """Axes in the first body alone, as rows."""
+        self._must_turn(0)
+        return dict(frame_a=basis(self._axis("`axis`", axis_a)))
 
     def _axis(self, role: str, axis: Any) -> Any:
         if axis is None:
@@ -72,6 +74,22 @@ class Ends(NamedTuple):
     def refuse_axes(self, *axes: Any) -> None:
         if any(axis is not None for axis in axes):
             raise ValueError(f"{self.part} is in the plane, where it has no axis to give.")
+
+    def only_bodies_that_turn(self) -> None:
+        self._must_turn(0)
+        self._must_turn(1)
+
+    def _must_turn(self, k: int) -> None:
+        if not self.turns[k]:
+            raise ValueError(
+                f"{self.part} needs the orientation of '{self.bodies[k]}', and a point "
+                "mass has none."
+            )
+
+    def only_joined(self, what: str) -> None:
+        if not self.joined:
+            a, b = self.bodies
+            raise ValueError(f"{self.part} {what}, and none connects '{a}' and '{b}'.")
 
     def only_in_space(self, what: str) -> None:
         if self.dimension == 2:

@@ -9,15 +9,16 @@ def summary(
     ends: dict[str, tuple[str, str]],
     rows: dict[str, slice],
 ) -> str:
-    """Bodies, joints and forces with what they are and what they count for."""
+    """Bodies, joints, forces and drives with what they are and what they count for."""
     bodies, joined = dict(layout.bodies), {x for pair in ends.values() for x in pair}
     internal = sum(kind.num_internal for kind in bodies.values())
     held = sum(place.stop - place.start for place in rows.values())
     world = "the plane" if layout.dimension == 2 else "space"
     freedom = layout.num_velocities - internal - held
+    holders = "joints and drives" if layout.drives else "joints"
     lines = [
         f"A scene in {world}: {layout.num_coordinates} coordinates, {held} constraints of "
-        f"joints, {freedom} degree{'' if freedom == 1 else 's'} of freedom."
+        f"{holders}, {freedom} degree{'' if freedom == 1 else 's'} of freedom."
     ]
     width = max(len(name) for name in kinds)
     line = lambda name, text: f"  {name:{width}}  {kinds[name]:14}  {text}".rstrip()

@@ -1,6 +1,10 @@
-"""Forces with a potential. Points are told as for joints, in the frames of the bodies."""
+"""Forces. Points are told as for joints, in the frames of the bodies.
 
-import abc
+Springs and constant forces have a potential. Dampers, actuators and loads have none: what
+they bring in is in `sol.audit.work`, and their functions are those of the time and of the
+`args` of the system.
+"""
+
 from collections.abc import Callable
 from typing import Any
 
@@ -8,22 +12,20 @@ import equinox as eqx
 from jaxtyping import Array
 
 from .._types import Args, Real, Vector
+from ._forces import AbstractForce as AbstractForce
 from ._frames import GROUND, Numbers
-from ._laws import AbstractLaw, PlanarTorsion, PlanarTwist, Pull, SpringEnergy, Torsion
+from ._laws import PlanarTorsion, PlanarTwist, Pull, SpringEnergy, Torsion
+from ._loads import (
+    Actuator as Actuator,
+    Damper as Damper,
+    Follower as Follower,
+    Load as Load,
+    TorsionActuator as TorsionActuator,
+    TorsionDamper as TorsionDamper,
+)
+from ._measures import AbstractLaw
 from ._numbers import number
 from ._start import Ends
-
-
-class AbstractForce(eqx.Module):
-    """A force between two bodies: `a` and `b` are names, or `"ground"`."""
-
-    name: eqx.AbstractVar[str]
-    a: eqx.AbstractVar[str]
-    b: eqx.AbstractVar[str]
-
-    @abc.abstractmethod
-    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
-        """The law of its energy and its numbers, from the start pose of its bodies."""
 
 
 class Spring(AbstractForce):

@@ -20,7 +20,8 @@ from jaxtyping import Array
 
 from .._types import Args, Real, Vector
 from ._frames import Numbers
-from ._laws import AbstractLaw, Alignment, Curve, Length
+from ._laws import Alignment, Curve, Length
+from ._measures import AbstractLaw
 from ._numbers import module_of, positive
 from ._start import Ends
 

@@ -1,4 +1,4 @@
-"""A scene: bodies, joints and forces, and the system that they make."""
+"""A scene: bodies, joints, forces and drives, and the system that they make."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -13,13 +13,17 @@ from .._system import State, System
 from .._tracing import is_known
 from .._types import Coordinates, Vector
 from ._compile import compile_parts, join, sort_parts
-from ._frames import Point
-from ._functions import evaluate, make_system
+from ._frames import Numbers, Point
+from ._functions import lift, make_system
+from ._laws import Driven
+from ._layout import Links
 from ._motions import first_dependent, Gap, gaps, reaction
 from ._parameters import Parameters
+from ._rows import members, rows_of
 from ._summary import summary
-from ._view import rows, View
+from ._view import View
 from .bodies import AbstractBody
+from .drives import AbstractDrive
 from .forces import AbstractForce
 from .joints import AbstractJoint
 
@@ -41,7 +45,7 @@ class Reaction(NamedTuple):
 
 
 class Scene:
-    """Bodies, joints and forces under names, compiled to a `System`.
+    """Bodies, joints, forces and drives under names, compiled to a `System`.
 
         scene = ej.Scene(
             [
@@ -58,11 +62,11 @@ class Scene:
 
     **Arguments:**
 
-    - `parts`: bodies, joints and forces in any order, each with a name of its own; the
-      name `"ground"` is taken. Coordinates stand body by body in this order.
+    - `parts`: bodies, joints, forces and drives in any order, each with a name of its own;
+      the name `"ground"` is taken. Coordinates stand body by body in this order.
     - `gravity`: the acceleration in space, two or three entries; none if not given.
-    - `args`: numbers of your own, for `Potential` and `Constraint`, found again under
-      their names in the `args` of the system.
+    - `args`: numbers of your own, for functions of yours, found again under their names
+      in the `args` of the system.
 
     A scene does not change. `system` is what `simulate` takes, `args` its `Parameters`, `q`
     and `v` the start as the parts tell it. Parts of a kind are evaluated together, so the
@@ -91,13 +95,16 @@ class Scene:
         self._layout, self.args = compile_parts(found, gravity, dict(args or {}))
         self._ends = {
             part.name: (part.a, part.b)
-            for kind in (AbstractJoint, AbstractForce)
+            for kind in (AbstractJoint, AbstractForce, AbstractDrive)
             for part in found[kind]
         }
         self._kinds = {part.name: type(part).__name__ for part in parts}
         self.system = make_system(self._layout)
         self.q, self.v = (join([getattr(b, x) for b in bodies]) for x in ("q", "v"))
-        self._rows = self._find_rows()
+        self._rows = rows_of(self._layout, self.q, self.args)
+        if self.system.force is not None:  # a function of the user's own may not fit
+            t = jnp.zeros((), self.q.dtype)
+            jax.eval_shape(self.system.force, self.q, self.v, t, self.args)
         self._check_gaps()
 
     def build(self) -> tuple[System, State, Parameters]:
@@ -142,7 +149,7 @@ class Scene:
 
         def velocity(q: Coordinates, v: Array) -> Point:
             place = lambda x: View(self._layout, x).position(body, point)
-            return jax.jvp(place, (q,), (self._lift(q, v),))[1]
+            return jax.jvp(place, (q,), (lift(self._layout, q, v),))[1]
 
         return self._along(velocity, ys)
 
@@ -157,7 +164,8 @@ class Scene:
     def reaction(
         self, sol: Solution | ConsistentStart, joint: str, args: Parameters | None = None
     ) -> Reaction:
-        """Force and torque of a joint on its second body, along a run or at a start.
+        """Force and torque of a joint or drive on its second body, along a run or at a
+        start.
 
         `args` are those of the run, where they are not the scene's own. Multipliers of a
         run are means over the step that ends at a row, and are taken to act there.
@@ -165,8 +173,7 @@ class Scene:
         args = self.args if args is None else args
         if joint not in self._rows or joint not in self._ends:
             raise ValueError(f"There is no joint '{joint}'; there are {[*self._rows]}.")
-        number, _ = self._layout.places["joints"][joint]
-        group, numbers = self._layout.joint_groups[number], args["joints"][joint]
+        group, numbers = self._link(joint, args)
 
         def at(q: Coordinates, multipliers: Array) -> tuple[Point, Array]:
             a, b = (View(self._layout, q).frame(body) for body in self._ends[joint])
@@ -176,10 +183,21 @@ class Scene:
         at = at if ys.q.ndim == 1 else jax.vmap(at)
         return Reaction(*at(ys.q, self.multipliers(sol, joint)))
 
+    def _link(self, joint: str, args: Parameters) -> tuple[Links, Numbers]:
+        places = self._layout.places
+        if joint in places["joints"]:
+            number, _ = places["joints"][joint]
+            return self._layout.joint_groups[number], args["joints"][joint]
+        number, _ = places["drives"][joint]
+        group = self._layout.drive_groups[number]
+        assert isinstance(group.law, Driven)
+        # What it prescribes has the slope of its measure.
+        return group._replace(law=group.law.measure), args["drives"][joint]
+
     def multipliers(
         self, sol: Solution | ConsistentStart, joint: str
     ) -> Float[Array, "... rows"]:
-        """The multipliers of a joint or constraint of a scene, one column for each row."""
+        """The multipliers of a joint, constraint or drive, one column for each row."""
         return sol.multipliers[..., self._rows[joint]]
 
     def __str__(self) -> str:
@@ -188,45 +206,14 @@ class Scene:
     def _along(self, function: Any, ys: State) -> Array:
         return (jax.vmap(function) if ys.q.ndim == 2 else function)(ys.q, ys.v)
 
-    def _lift(self, q: Coordinates, v: Array) -> Coordinates:
-        """The rates of the coordinates."""
-        rates = jnp.zeros_like(q)
-        for group in self._layout.body_groups:
-            lifted = jax.vmap(group.kind.lift)(rows(q, group.q), rows(v, group.v))
-            rates = rates.at[group.q].set(lifted)
-        return rates
-
-    def _members(self) -> list[tuple[str, ...]]:
-        """The names of all joints and constraints, as their rows follow each other."""
-        joined = [group.names for group in self._layout.joint_groups]
-        return joined + [(name,) for name, _ in self._layout.constraints]
-
-    def _find_rows(self) -> dict[str, slice]:
-        """The rows of the constraint that belong to each joint."""
-        places, first = {}, 0
-
-        def sizes(q: Coordinates) -> list[Array]:
-            view, tables = View(self._layout, q), self.args.tables["joints"]
-            groups = zip(self._layout.joint_groups, tables, strict=True)
-            found = [evaluate(group, view, numbers) for group, numbers in groups]
-            return found + [f(view, self.args)[None] for _, f in self._layout.constraints]
-
-        for members, shape in zip(
-            self._members(), jax.eval_shape(sizes, self.q), strict=True
-        ):
-            for name in members:
-                places[name] = slice(first, first + shape.shape[1])
-                first += shape.shape[1]
-        return places
-
     def _gaps(self) -> tuple[dict[str, Gap], float]:
         """The gaps by name, and the size of the scene."""
-        rates = self._lift(self.q, self.v)
+        rates = lift(self._layout, self.q, self.v)
         found, size = jax.device_get(gaps(self._layout, self.q, rates, self.args))
         named = {
             name: Gap(float(x), float(v))
-            for members, (xs, vs) in zip(self._members(), found, strict=True)
-            for name, x, v in zip(members, xs, vs, strict=True)
+            for names, (xs, vs) in zip(members(self._layout), found, strict=True)
+            for name, x, v in zip(names, xs, vs, strict=True)
         }
         return named, float(size)
 

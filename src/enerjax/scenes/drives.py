@@ -1,0 +1,123 @@
+"""Drives: what is moved on a schedule.
+
+Each takes a `motion(t, args)`, a smooth function of the time and of the `args` of the
+system; its velocity and acceleration are derived. Points and axes are told as for joints.
+A scene starts at `t = 0`, with the velocities that its drives prescribe there. What a drive
+takes, force or torque, is its `scene.reaction`, and its power is in `sol.audit.drive_work`.
+"""
+
+import abc
+from collections.abc import Callable
+
+import equinox as eqx
+from jaxtyping import Array
+
+from .._types import Args, Scalar, Vector
+from ._frames import GROUND, Numbers
+from ._laws import Driven
+from ._measures import AbstractLaw, Place, PlanarTurn, Separation, Slide, Turn
+from ._numbers import check_signal
+from ._start import Ends
+
+
+class AbstractDrive(eqx.Module):
+    """A drive of a scene: `a` and `b` are names of bodies, or `"ground"`."""
+
+    name: eqx.AbstractVar[str]
+    a: eqx.AbstractVar[str]
+    b: eqx.AbstractVar[str]
+    motion: eqx.AbstractVar[Callable[[Scalar, Args], Array]]
+
+    def __check_init__(self):
+        check_signal(self.name, "motion", self.motion)
+
+    @abc.abstractmethod
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        """Its law and its numbers, from the start pose of its bodies."""
+
+
+class Angle(AbstractDrive):
+    """Prescribes the angle of the second body against the first: a motor that turns.
+
+    In the plane the difference of their angles. In space the turn from the start pose
+    about `axis`, told in the first body, of two bodies that a revolute or cylindrical
+    joint connects about this axis; over any number of turns.
+    """
+
+    name: str
+    a: str
+    b: str
+    motion: Callable[[Scalar, Args], Array]
+    axis: Vector | None = None
+
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        if ends.dimension == 2:
+            ends.refuse_axes(self.axis)
+            ends.only_bodies_that_turn()
+            return Driven(PlanarTurn(), self.motion), {}
+        ends.only_joined("has an angle only with a joint about its axis: a `Revolute`")
+        return Driven(Turn(), self.motion), ends.axes(self.axis)
+
+
+class Displacement(AbstractDrive):
+    """Prescribes how far the second point is from the first, along an axis of body `a`.
+
+    Points that are not given are the origins of the frames.
+    """
+
+    name: str
+    a: str
+    b: str
+    motion: Callable[[Scalar, Args], Array]
+    point_a: Vector | None = None
+    point_b: Vector | None = None
+    axis: Vector | None = None
+
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        points = ends.origins(self.point_a, self.point_b)
+        return Driven(Slide(), self.motion), points | ends.first_axes(self.axis)
+
+
+class Distance(AbstractDrive):
+    """Prescribes the distance of two points, which must stay positive: a hydraulic ram.
+
+    Points that are not given are the origins of the frames.
+    """
+
+    name: str
+    a: str
+    b: str
+    motion: Callable[[Scalar, Args], Array]
+    point_a: Vector | None = None
+    point_b: Vector | None = None
+
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        numbers = ends.origins(self.point_a, self.point_b)
+        return Driven(Separation(), self.motion), numbers
+
+
+class Position(AbstractDrive):
+    """Leads a point of a `body` along a path in space; `motion` returns the position.
+
+    The point is the mass centre if it is not given.
+    """
+
+    name: str
+    a: str
+    b: str
+    motion: Callable[[Scalar, Args], Array]
+    point: Vector | None
+
+    def __init__(
+        self,
+        name: str,
+        body: str,
+        motion: Callable[[Scalar, Args], Array],
+        point: Vector | None = None,
+    ):
+        self.name, self.a, self.b = name, GROUND, body
+        self.motion, self.point = motion, point
+
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        point = ends.origins(None, self.point)["point_b"]
+        return Driven(Place(), self.motion), dict(point_b=point)
