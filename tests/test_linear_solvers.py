@@ -8,7 +8,9 @@ import pytest
 import enerjax as ej
 
 
-@pytest.mark.parametrize("solver", ["LU", "QR", "KLU"])
+@pytest.mark.parametrize(
+    "solver", ["LU", pytest.param("QR", marks=pytest.mark.slow), "KLU"]
+)
 def test_a_given_linear_solver_is_used(solver):
     """The same motion and derivatives, whoever solves the linear systems."""
     if solver == "KLU":

@@ -110,6 +110,7 @@ ANDREWS = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_squeezer_reaches_the_published_angles():
     solution = run(made("squeezer"), "composed 4", 1e-4, 300)
     k1, k2, k3, k4, k5, k6, k7 = solution.ys.q[-1, 2::3]

@@ -72,7 +72,13 @@ def test_without_being_declared_they_are_refused():
         _start(system, args)
 
 
-@pytest.mark.parametrize("scheme", ["preserving", "decaying", "consistent"])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "scheme",
+    ["preserving", *[pytest.param(s, marks=SLOW) for s in ("decaying", "consistent")]],
+)
 def test_the_motion_is_that_of_the_independent_constraints(scheme):
     runs = [_run(4, scheme, h, n) for h, n in ((5e-3, 100), (2.5e-3, 200))]
     error = [np.max(np.abs(run.ys.q[-1] - _exact())) for run in runs]
