@@ -129,3 +129,24 @@ def test_derivatives_are_unique():
     assert reverse == pytest.approx(float(change), rel=1e-7)  # truncation
     least = jax.grad(lambda l: tip(l, 2, False))(1.0)
     assert reverse == pytest.approx(float(least), rel=2e-3)  # truncation, of the scheme
+
+
+def test_a_scene_names_the_rows_that_repeat_others():
+    """A third crank of a parallelogram."""
+    up = np.array([np.cos(ANGLE), np.sin(ANGLE)])
+    feet = [np.array([x, 0.0]) for x in (0.0, 2.0, 1.0)]
+    beam = ej.bodies.PlanarBody.rod("beam", 1.0, feet[0] + up, feet[1] + up)
+    cranks = [
+        ej.joints.Distance(name, "ground", "beam", foot, foot - feet[2])
+        for name, foot in zip(("left", "right", "middle"), feet, strict=True)
+    ]
+    scene = ej.Scene([beam, *cranks], gravity=[0.0, -G], redundant=True)
+    found = scene.mobility()
+    assert (found.degrees_of_freedom, found.rank) == (1, 2)
+    assert len(found.redundant) == 1
+    assert found.redundant[0] in ("left", "right", "middle")
+    system, start, args = scene.build()
+    run = ej.simulate(system, ej.EnergyPreserving(), start, args, h=5e-3, num_steps=60)
+    assert np.ptp(run.audit.energy) <= 1e3 * EPS * G  # solver
+    pulls = [float(np.linalg.norm(scene.reaction(run, c.name).force[-1])) for c in cranks]
+    assert min(pulls) > 0.1 * max(pulls)  # of least norm: all carry

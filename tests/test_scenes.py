@@ -165,6 +165,8 @@ def test_what_is_off_a_little_is_reported_and_closed():
     start = scene.start()
     end = scene.position(start, "rod", [-0.5, 0.004])
     np.testing.assert_allclose(end, [0.0, 0.003], rtol=0, atol=1e-14)
+    gap = scene.report(start)["pin"]
+    assert max(gap) <= 1e-14  # round-off
 
 
 def test_forces_have_the_energies_that_they_say():

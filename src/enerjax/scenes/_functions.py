@@ -18,7 +18,7 @@ from ._parameters import Parameters
 from ._view import rows, View
 
 
-def make_system(layout: Layout) -> System:
+def make_system(layout: Layout, over_constrained: bool) -> System:
     """The system of a scene; its `args` are `Parameters`."""
     redundant = any(group.kind.num_redundant for group in layout.body_groups)
     return System(
@@ -29,6 +29,7 @@ def make_system(layout: Layout) -> System:
         coordinate_constraint=eqx.Partial(redundancy, layout) if redundant else None,
         force=eqx.Partial(force, layout) if layout.has_pushes else None,
         driven=eqx.Partial(driven, layout) if layout.drives else None,
+        redundant=over_constrained,
     )
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._types import Coordinates
-from ._functions import constraint, drives_at, evaluate
+from ._functions import constraint, drives_at, evaluate, redundancy
 from ._layout import Layout
 from ._parameters import Parameters
 from ._view import View
@@ -46,3 +46,18 @@ def rows_of(layout: Layout, q: Coordinates, args: Parameters) -> dict[str, slice
             places[name] = slice(first, first + shape[1])
             first += shape[1]
     return places
+
+
+def row_names(
+    layout: Layout, q: Coordinates, args: Parameters, rows: dict[str, slice]
+) -> list[str]:
+    """A name for each row of all constraints, in the order of multipliers."""
+    inside = jax.eval_shape(lambda q: constraint(layout, q, args), q).size
+    outside = jax.eval_shape(lambda q: redundancy(layout, q, args), q).size
+    last = max([inside, *(place.stop for place in rows.values())])
+    names = [str(k) for k in range(last + outside)]
+    for name, place in rows.items():
+        several = place.stop - place.start > 1
+        for k in range(place.start, place.stop):
+            names[k] = f"{name}[{k - place.start}]" if several else name
+    return names

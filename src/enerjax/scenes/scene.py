@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._analysis import Mobility, mobility
 from .._initial import ConsistentStart, initial_state
 from .._solution import Solution
 from .._system import State, System
 from .._tracing import is_known
-from .._types import Coordinates, Vector
+from .._types import Coordinates, Real, Vector
 from ._compile import compile_parts, join, sort_parts
 from ._frames import Numbers, Point
 from ._functions import lift, make_system
@@ -19,7 +20,7 @@ from ._laws import Driven
 from ._layout import Links
 from ._motions import first_dependent, Gap, gaps, reaction
 from ._parameters import Parameters
-from ._rows import members, rows_of
+from ._rows import members, row_names, rows_of
 from ._summary import summary
 from ._view import View
 from .bodies import AbstractBody
@@ -67,6 +68,7 @@ class Scene:
     - `gravity`: the acceleration in space, two or three entries; none if not given.
     - `args`: numbers of your own, for functions of yours, found again under their names
       in the `args` of the system.
+    - `redundant`: whether joints may repeat what others hold; see `System`.
 
     A scene does not change. `system` is what `simulate` takes, `args` its `Parameters`, `q`
     and `v` the start as the parts tell it. Parts of a kind are evaluated together, so the
@@ -89,6 +91,8 @@ class Scene:
         parts: Sequence[Any],
         gravity: Vector | None = None,
         args: dict[str, Any] | None = None,
+        *,
+        redundant: bool = False,
     ):
         found = sort_parts(parts)
         bodies: list[AbstractBody] = found[AbstractBody]
@@ -99,7 +103,7 @@ class Scene:
             for part in found[kind]
         }
         self._kinds = {part.name: type(part).__name__ for part in parts}
-        self.system = make_system(self._layout)
+        self.system = make_system(self._layout, redundant)
         self.q, self.v = (join([getattr(b, x) for b in bodies]) for x in ("q", "v"))
         self._rows = rows_of(self._layout, self.q, self.args)
         if self.system.force is not None:  # a function of the user's own may not fit
@@ -129,13 +133,23 @@ class Scene:
                 f"{error} In this scene '{name}' repeats what other joints hold already."
             ) from None
 
-    def report(self) -> dict[str, Gap]:
-        """How far each joint was from closed in the start as the parts tell it, by name.
+    def report(self, state: State | None = None) -> dict[str, Gap]:
+        """How far each joint is from closed, by name: in the start as the parts tell it,
+        or in another state, such as `start()`.
 
         `position` is a length (an angle counts as an arc of the size of the scene),
         `velocity` its rate.
         """
-        return self._gaps()[0]
+        return self._gaps(state)[0]
+
+    def mobility(self, state: State | None = None, *, t: Real = 0.0) -> Mobility:
+        """The freedoms of the scene in a pose, its start if none is given; see `mobility`.
+
+        Rows are named by their joint, `"hinge[0]"`; those within bodies by their number.
+        """
+        state = State(self.q, self.v) if state is None else state
+        names = row_names(self._layout, self.q, self.args, self._rows)
+        return mobility(self.system, state, self.args, t=t, names=names)
 
     def position(self, ys: State, body: str, point: Vector | None = None) -> Array:
         """A point of a body in space along a run, shape `(times, d)`; of one state `(d,)`.
@@ -206,10 +220,11 @@ class Scene:
     def _along(self, function: Any, ys: State) -> Array:
         return (jax.vmap(function) if ys.q.ndim == 2 else function)(ys.q, ys.v)
 
-    def _gaps(self) -> tuple[dict[str, Gap], float]:
+    def _gaps(self, state: State | None = None) -> tuple[dict[str, Gap], float]:
         """The gaps by name, and the size of the scene."""
-        rates = lift(self._layout, self.q, self.v)
-        found, size = jax.device_get(gaps(self._layout, self.q, rates, self.args))
+        state = State(self.q, self.v) if state is None else state
+        rates = lift(self._layout, state.q, state.v)
+        found, size = jax.device_get(gaps(self._layout, state.q, rates, self.args))
         named = {
             name: Gap(float(x), float(v))
             for names, (xs, vs) in zip(members(self._layout), found, strict=True)
