@@ -124,10 +124,8 @@ def damped_reference():
     return np.array([np.sin(angle) + r * np.sin(w * T1), np.cos(angle)])
 
 
-@pytest.mark.parametrize(
-    "scheme",
-    ["rattle", *[pytest.param(s, marks=pytest.mark.slow) for s in ("alpha", "alpha ggl")]],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["rattle", "alpha", "alpha ggl"])
 def test_order_with_a_damper_and_a_drive(scheme):
     args, start, method = ARGS | dict(c=0.4), shaken_start(), SCHEMES[scheme]
     runs = [
