@@ -70,7 +70,7 @@ def to_diffrax(
     (1985) 77-90, on index reduction and the drift that it brings.
     """
     try:
-        import diffrax
+        import diffrax  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ImportError(
             "`to_diffrax` needs diffrax, which is part of the extra `diffrax`: "
