@@ -74,19 +74,18 @@ class Linearisable(eqx.Module):
 
         Of a singular Jacobian with a `fill` the solution without part in its null space.
         """
-        matrix = self.jacobian(x)
-        if self.fill is None:
-            return self._solve(x, matrix, right)
-        # What the fill has changed is taken back, but for its square.
-        first = self._solve(x, matrix, right)
-        return first + self._solve(x, matrix, self.fill * first)
+        solve = self._solver(x)
+        first = solve(right)
+        # What a fill has changed is taken back, but for its square.
+        return first if self.fill is None else first + solve(self.fill * first)
 
-    def _solve(
-        self, x: Float[Array, " n"], matrix: Array, right: Float[Array, " n"]
-    ) -> Array:
+    def _solver(self, x: Float[Array, " n"]) -> Callable[[Array], Array]:
+        """Solves with the Jacobian at `x`, filled."""
+        matrix = self.jacobian(x)
         if self.is_dense:
             # An explicit inverse loses too many digits of what is nearly singular.
-            return (solve if self.fill is None else jnp.linalg.solve)(matrix, right)
+            by = solve if self.fill is None else jnp.linalg.solve
+            return lambda right: by(matrix, right)
         factors = self.form.empty(x.size, x.dtype).renewed(matrix)
         factors = jax.lax.stop_gradient(factors)
 
@@ -94,7 +93,7 @@ class Linearisable(eqx.Module):
             image = jax.jvp(self.value, (x,), (t,))[1]
             return image if self.fill is None else image + self.fill * t
 
-        return jax.lax.custom_linear_solve(
+        return lambda right: jax.lax.custom_linear_solve(
             product,
             right,
             lambda _, right: factors.solve(right),
