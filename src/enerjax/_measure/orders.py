@@ -7,7 +7,7 @@ import numpy as np
 from .._schemes import AbstractScheme
 from .reference import Reals
 from .runs import Given, measure, Problem, Runs
-from .text import aligned, number
+from .text import number, with_uncertainty
 
 
 _NAMES = ("q", "v", "multipliers")
@@ -56,8 +56,7 @@ class OrderTable:
                     order = getattr(self, f"order_{name}")[i, j - 1] if j > 0 else np.nan
                     cells.append("" if np.isnan(order) else f"{order:.2f}")
                 rows.append([*cells, self.failures[i][j]])
-        known = ", ".join(f"{x} {number(u)}" for x, u in self.uncertainty.items())
-        return f"{aligned(rows)}\nuncertainty of the reference: {known}"
+        return with_uncertainty(rows, self.uncertainty)
 
     def plot(self) -> Any:
         """Errors of positions and velocities against the step, as a figure."""

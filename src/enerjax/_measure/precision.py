@@ -6,7 +6,7 @@ from .._check import positive_integer
 from .._schemes import AbstractScheme
 from .reference import Reals
 from .runs import Given, measure, Problem
-from .text import aligned, number
+from .text import number, with_uncertainty
 
 
 _COLUMNS = (
@@ -75,8 +75,7 @@ class WorkPrecision:
                 count, seconds = self.evaluations[i, j], self.seconds[i, j]
                 costs = [f"{x:.4g}" if x == x else "" for x in (count, 1e3 * seconds)]
                 rows.append((name, f"{h:.4g}", *errors, *costs, self.failures[i][j]))
-        known = ", ".join(f"{x} {number(u)}" for x, u in self.uncertainty.items())
-        return f"{aligned(rows)}\nuncertainty of the reference: {known}"
+        return with_uncertainty(rows, self.uncertainty)
 
     def plot(self) -> Any:
         """Error of the positions against time and against corrections, as a figure."""

@@ -13,6 +13,12 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([line(header), line(["-" * w for w in widths]), *map(line, body)])
 
 
+def with_uncertainty(rows: Sequence[Sequence[str]], uncertainty: dict[str, float]) -> str:
+    """A table of errors, and how well their reference is known."""
+    known = ", ".join(f"{name} {number(u)}" for name, u in uncertainty.items())
+    return f"{aligned(rows)}\nuncertainty of the reference: {known}"
+
+
 def number(x: float) -> str:
     """An error in two digits; nothing where it is not known."""
     return "" if x != x else f"{x:.1e}"
