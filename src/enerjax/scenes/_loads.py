@@ -11,11 +11,9 @@ from ._frames import GROUND, Numbers
 from ._laws import Acting, Following, Viscous
 from ._measures import (
     AbstractLaw,
-    AbstractMeasure,
     Place,
-    PlanarTurn,
     Separation,
-    Turn,
+    turn_of,
 )
 from ._numbers import check_signal, number
 from ._start import Ends
@@ -56,20 +54,12 @@ class TorsionDamper(AbstractForce):
     axis: Vector | None = None
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
-        measure, numbers = _turning(ends, self.axis)
+        measure, numbers = turn_of(ends, self.axis)
         return Viscous(measure), numbers | _damping(ends, self.damping)
 
 
 def _damping(ends: Ends, damping: Real) -> Numbers:
     return dict(damping=number(ends.part, "`damping`", damping, (), least=0.0))
-
-
-def _turning(ends: Ends, axis: Vector | None) -> tuple[AbstractMeasure, Numbers]:
-    if ends.dimension == 2:
-        ends.refuse_axes(axis)
-        ends.only_bodies_that_turn()
-        return PlanarTurn(), {}
-    return Turn(), ends.axes(axis)
 
 
 class Actuator(AbstractForce):
@@ -111,7 +101,7 @@ class TorsionActuator(AbstractForce):
         check_signal(self.name, "torque", self.torque)
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
-        measure, numbers = _turning(ends, self.axis)
+        measure, numbers = turn_of(ends, self.axis)
         return Acting(measure, self.torque), numbers
 
 

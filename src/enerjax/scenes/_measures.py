@@ -10,8 +10,9 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
-from .._types import Multipliers, Scalar
+from .._types import Multipliers, Scalar, Vector
 from ._frames import Frame, Numbers, Point
+from ._start import Ends
 
 
 class AbstractLaw(abc.ABC):
@@ -96,3 +97,12 @@ class Turn(AbstractMeasure):
         x, y = (a.direction(numbers["frame_a"][k]) for k in (0, 1))
         turned = b.direction(numbers["frame_b"][0])
         return jnp.sum(turned * x), jnp.sum(turned * y)
+
+
+def turn_of(ends: Ends, axis: Vector | None) -> tuple[AbstractMeasure, Numbers]:
+    """The angle between two bodies, in space about an axis; its numbers."""
+    if ends.dimension == 2:
+        ends.refuse_axes(axis)
+        ends.only_bodies_that_turn()
+        return PlanarTurn(), {}
+    return Turn(), ends.axes(axis)

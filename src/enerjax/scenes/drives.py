@@ -15,7 +15,7 @@ from jaxtyping import Array
 from .._types import Args, Scalar, Vector
 from ._frames import GROUND, Numbers
 from ._laws import Driven
-from ._measures import AbstractLaw, Place, PlanarTurn, Separation, Slide, Turn
+from ._measures import AbstractLaw, Place, Separation, Slide, turn_of
 from ._numbers import check_signal
 from ._start import Ends
 
@@ -51,12 +51,10 @@ class Angle(AbstractDrive):
     axis: Vector | None = None
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
-        if ends.dimension == 2:
-            ends.refuse_axes(self.axis)
-            ends.only_bodies_that_turn()
-            return Driven(PlanarTurn(), self.motion), {}
-        ends.only_joined("has an angle only with a joint about its axis: a `Revolute`")
-        return Driven(Turn(), self.motion), ends.axes(self.axis)
+        if ends.dimension == 3:
+            ends.only_joined("has an angle only with a joint about its axis: a `Revolute`")
+        measure, numbers = turn_of(ends, self.axis)
+        return Driven(measure, self.motion), numbers
 
 
 class Displacement(AbstractDrive):
