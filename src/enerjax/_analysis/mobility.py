@@ -3,14 +3,15 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 import scipy.linalg
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from .._check import check_system
 from .._linear import as_dense
-from .._model import AbstractModel, make_model
+from .._model import make_model
 from .._system import AbstractSystem, State
 from .._types import Args, Real
 
@@ -71,8 +72,7 @@ def mobility(
     **Raises:** `ValueError` for bad input, and for a wrong number of names.
     """
     state, args = check_system(system, state, args, t)
-    model = make_model(system, state, args)
-    scaled, root, residual = _scaled_constraints(model, state)
+    scaled, root, residual = _scaled_constraints(system, state, args)
     num_constraints, num_coordinates = scaled.shape
     if names is None:
         names = [str(k) for k in range(num_constraints)]
@@ -103,18 +103,25 @@ def mobility(
 
 
 def _scaled_constraints(
-    model: AbstractModel, state: State
+    system: AbstractSystem, state: State, args: Args
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`dPhi/dq` in units of the constraints and the inertia, the root of the inertia, and
     the residual in parts of the sizes of the constraints."""
-    inner = model.enter(state)
-    root = np.linalg.cholesky(np.asarray(as_dense(model.metric(inner))))
-    jacobian = np.asarray(jax.jacfwd(model.constraint)(state.q, state.t))
+    metric, jacobian, residual, size = map(np.asarray, _linearised(system, state, args))
+    root = np.linalg.cholesky(metric)
     scaled = scipy.linalg.solve_triangular(root, jacobian.T, lower=True).T
     lengths = np.linalg.norm(scaled, axis=1)
     unit = np.where(lengths > 0, lengths, 1.0)
-    size = np.asarray(model.scales.constraint_size)
-    residual = np.asarray(model.constraint(state.q, state.t)) / np.where(
-        size > 0, size, 1.0
-    )
-    return scaled / unit[:, None], root, residual
+    return scaled / unit[:, None], root, residual / np.where(size > 0, size, 1.0)
+
+
+@eqx.filter_jit
+def _linearised(
+    system: AbstractSystem, state: State, args: Args
+) -> tuple[Array, Array, Array, Array]:
+    """The inertia in the coordinates; the constraints: gradients, residuals, sizes."""
+    model = make_model(system, state, args)
+    metric = as_dense(model.metric(model.enter(state)))
+    jacobian = jax.jacfwd(model.constraint)(state.q, state.t)
+    residual = model.constraint(state.q, state.t)
+    return metric, jacobian, residual, model.scales.constraint_size
