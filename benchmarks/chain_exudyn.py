@@ -51,11 +51,22 @@ def end(
     masses: Sequence[float], length: float, h: float, end: float, rho: float
 ) -> np.ndarray:
     """Positions at the end of a run."""
+    return end_state(masses, length, h, end, rho)[0]
+
+
+def end_state(
+    masses: Sequence[float], length: float, h: float, end: float, rho: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and velocities at the end of a run."""
     _container, system, nodes = _build(masses, length)
     settings = _settings(h, round(end / h), rho, len(masses) > 8)
     system.SolveDynamic(settings, solverType=exu.DynamicSolverType.GeneralizedAlpha)
-    position = exu.OutputVariableType.Position
-    return np.concatenate([system.GetNodeOutput(node, position)[:2] for node in nodes])
+    kinds = exu.OutputVariableType
+    q, v = (
+        np.concatenate([system.GetNodeOutput(node, kind)[:2] for node in nodes])
+        for kind in (kinds.Position, kinds.Velocity)
+    )
+    return q, v
 
 
 def us_per_step(num_links: int, h: float, steps: int, repeats: int = 3) -> float:

@@ -76,7 +76,7 @@ def _start(work: Work) -> np.ndarray:
     return y.ravel()
 
 
-def _swing(t: Any, y: Any, args: Any) -> Any:
+def swing(t: Any, y: Any, args: Any) -> Any:
     """Angles from the horizontal and rates of one or two points; gravity acts along +y."""
     size = y.size // 2
     angle, rate = y[:size], y[size:]
@@ -102,7 +102,7 @@ def diffrax_rows(work: Work, exact: np.ndarray, repeats: int) -> Rows:
         return
     forms: list[tuple[str, Any, Any, Any, Callable]] = []
     if work.size in (1, 2):
-        term = diffrax.ODETerm(_swing)
+        term = diffrax.ODETerm(swing)
         y0, args = jnp.zeros(2 * work.size), jnp.array(work.masses)
         forms.append(("minimal", term, y0, args, lambda y: _points(y[: work.size])))
     if work.is_top:
