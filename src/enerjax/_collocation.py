@@ -96,7 +96,7 @@ def rates_along(
 
     def improve(f: Pair, _: None) -> tuple[Pair, None]:
         moved = _combine(weights, f)
-        return rates_at(jax.tree.map(lambda a, x: a + h * x, begin, moved)), None
+        return rates_at(jax.tree.map(lambda a, x: a[None] + h * x, begin, moved)), None
 
     f = rates_at(_hermite(inner, h, begin, (end.q, end.v), first, last))
     return jax.lax.scan(improve, f, None, length=turns)[0] if turns > 0 else f

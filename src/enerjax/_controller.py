@@ -69,9 +69,11 @@ class _Memory(eqx.Module):
     # Of the step to come, and of the last three that were accepted, newest first.
     length: Scalar
     before: Float[Array, "3"]
-    # Of the last accepted step; and whether the last one tried was rejected.
+    # Of the last accepted step.
     error: Scalar
+    # Whether a step was rejected since, and whether one was for its error.
     rejected: Flag
+    inaccurate: Flag
     # The rates of change in the state that is reached.
     rates: Pair
 
@@ -94,7 +96,8 @@ class ControlledSteps(AbstractPace):
         first = self.first()
         at_start = _constant(rates(model, start))
         same, one = jnp.full((3,), first), jnp.ones_like(first)
-        return _Memory(first, same, one, jnp.array(False), at_start)
+        no = jnp.array(False)
+        return _Memory(first, same, one, no, no, at_start)
 
     def first(self) -> Scalar:
         return jax.lax.stop_gradient(jnp.minimum(self.first_length, 1.0))
@@ -140,7 +143,8 @@ class ControlledSteps(AbstractPace):
         # The reverse pass is spared the estimates.
         accepted, next_length = checkpoint_name((accepted, next_length), ROOT)
         too_short = ~accepted & (next_length < jnp.finfo(length.dtype).eps ** 0.75)
-        cause = RESULTS.where(solved, RESULTS.steps_too_short, out.result)
+        inaccurate = ~accepted & (solved | memory.inaccurate)
+        cause = RESULTS.where(inaccurate, RESULTS.steps_too_short, out.result)
         before = jnp.concatenate([length[None], memory.before[:2]])
         choose = lambda new, old: jnp.where(accepted, new, old)
         after = _Memory(
@@ -148,6 +152,7 @@ class ControlledSteps(AbstractPace):
             choose(before, memory.before),
             choose(error, memory.error),
             ~accepted,
+            inaccurate,
             jax.tree.map(choose, reached, memory.rates),
         )
         return Verdict(accepted, RESULTS.where(too_short, cause, RESULTS.successful), after)
