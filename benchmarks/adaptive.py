@@ -135,9 +135,9 @@ def show(rows: list[harness.Row]) -> None:
         if row["kind"] == "adaptive":
             print(
                 f"{row['case']:11s} {row['scheme']:32s} {row['mode']:8s} "
-                f"tol {row['value']:.0e}: error {row['error']:.1e}, {row['steps']:6d} steps, "
-                f"{row['rejected']:3d} rejected, {row['iterations'] / row['steps']:5.2f} "
-                f"corrections a step, {1e3 * row['seconds']:8.2f} ms, leak {row['leak']:.0e}; "
+                f"{row['value']:.0e}: error {row['error']:.1e}, {row['steps']:5d} steps "
+                f"({row['rejected']:2d} rejected), {row['iterations'] / row['steps']:5.2f} "
+                f"corrections, {1e3 * row['seconds']:6.1f} ms, leak {row['leak']:.0e}: "
                 f"one length takes {row.get('fewer_steps', np.nan):5.1f} x the steps, "
                 f"{row.get('fewer_seconds', np.nan):5.1f} x the time"
                 + (" FAILED" if row["failed"] else "")

@@ -1,6 +1,7 @@
 """Steps of varying length: their errors, their energy, their derivatives."""
 
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,18 +18,16 @@ from .helpers import problem
 from .references import double_pendulum_reference
 
 
-def adaptive(name, scheme, tolerance, t1, *, h=0.01, args=None, **options):
+def adaptive(name, scheme, tolerance, t1, args=None, **options):
     system, start, own = problem(name) if isinstance(name, str) else name
-    return ej.simulate(
-        system,
-        scheme,
-        start,
-        own if args is None else args,
-        h=h,
-        t1=t1,
-        controller=ej.StepController(tolerance, tolerance),
-        **dict(max_steps=512) | options,
-    )
+    args = own if args is None else args
+    controller = ej.StepController(tolerance, tolerance)
+    options: dict[str, Any] = dict(h=0.01, max_steps=512, controller=controller) | options
+    return ej.simulate(system, scheme, start, args, t1=t1, **options)
+
+
+def tried(sol):
+    return int(sol.stats.completed_steps) + int(sol.stats.rejected_steps)
 
 
 # The estimate ---------------------------------------------------------------------------
@@ -110,8 +109,7 @@ def test_the_energy_balance_holds_at_round_off_while_steps_vary():
 def test_requested_rows_count_the_energy_of_the_steps_that_have_ended():
     steps = damped_run()
     ts = [0.0, 0.7123, 1.3, 2.0]
-    options = dict(ts=ts)
-    sol = adaptive(damped_double_pendulum(), ej.EnergyConsistent(0.5), 1e-5, 2.0, **options)
+    sol = adaptive(damped_double_pendulum(), ej.EnergyConsistent(0.5), 1e-5, 2.0, ts=ts)
     for name in ("work", "dissipated"):
         rows, each = getattr(sol.audit, name), getattr(steps.audit, name)
         for row in (1, 2, 3):
@@ -131,10 +129,9 @@ def test_an_eccentric_planet_takes_a_third_of_the_steps():
     scheme = ej.EnergyConsistent(0.0)
     sol = adaptive(planet, scheme, 1e-6, period)
     error = float(jnp.abs(sol.ys.q[-1] - start.q).max())
-    tried = int(sol.stats.completed_steps + sol.stats.rejected_steps)
     # Truncation: a hundred times the tolerance.
     assert error < 1e-4
-    h = period / (3 * tried)
+    h = period / (3 * tried(sol))
     fixed = ej.simulate(system, scheme, start, args, h=h, t1=period, max_steps=512)
     assert float(jnp.abs(fixed.ys.q[-1] - start.q).max()) > 2 * error
 
@@ -148,7 +145,7 @@ def test_a_step_that_newton_fails_in_is_repeated_shorter():
     assert whole.result != ej.RESULTS.successful
     run = functools.partial(adaptive, "double", ej.EnergyPreserving())
     sol = run(1e-4, 40.0, h=30.0, ts="steps", throw=False, max_steps=256)
-    assert sol.stats.rejected_steps >= 1
+    assert tried(sol) > sol.stats.completed_steps
     # Out of steps long before 40 s, but on its way, and rows up to there are kept.
     assert sol.result == ej.RESULTS.out_of_steps
     count = int(sol.stats.completed_steps)
@@ -170,7 +167,7 @@ def test_bad_controllers():
     system, start, args = problem("pendulum")
     run = functools.partial(ej.simulate, system, ej.EnergyPreserving(), start, args)
     with pytest.raises(TypeError, match="must be a `StepController"):
-        run(h=0.1, t1=1.0, controller=1e-6)
+        run(h=0.1, t1=1.0, controller=1e-6)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="Got `num_steps`, `controller`"):
         run(h=0.1, num_steps=4, controller=ej.StepController(1e-6, 1e-6))
 

@@ -41,6 +41,12 @@ class Solution(eqx.Module):
     - `result`: `RESULTS.successful`, or the first failure.
 
     Rows after a failed step are NaN; those before it are what they would be without it.
+
+    At times that were requested (`simulate(..., t1=..., ts=...)`) multipliers and details
+    are those of the step that a row lies in or ends. The energies of the audit are those of
+    its state; dissipation and work are those of the steps that have ended since the row
+    before (of the first row since the start). So the balance of the audit is exact between
+    rows at the ends of steps: the start, the end, and all rows of `ts="steps"`.
     """
 
     ts: Float[Array, " times"]
