@@ -31,7 +31,7 @@ LAYERS = [
     {"_check"},
     {"_solve"},
     {"_step", "_projection", "_reverse", "_analysis", "_diffrax"},
-    {"_initial", "_failure", "_pace", "_collocation", "_prediction"},
+    {"_initial", "_selection", "_pace", "_collocation", "_prediction"},
     {"_controller", "_dense_output"},
     *({name} for name in ("_rows", "_to_time", "_simulate")),
     *({name} for name in ("_measure", "scenes", "problems", "_report", "__main__")),

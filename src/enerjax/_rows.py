@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ._dense_output import Bracket, state_within
-from ._failure import nan_unless
+from ._selection import nan_unless
 from ._model import AbstractModel
 from ._system import State
 from ._types import Count, Flag, Multipliers, Scalar, Times

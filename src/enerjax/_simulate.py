@@ -8,7 +8,7 @@ from jaxtyping import Array
 from ._audit import audit
 from ._check import check_form, positive_integer, prepare
 from ._controller import StepController
-from ._failure import check_start, failed_step, nan_unless, select
+from ._selection import check_start, failed_step, nan_unless, select
 from ._model import make_model
 from ._newton import Newton
 from ._results import first_failure, RESULTS

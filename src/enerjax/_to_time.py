@@ -10,7 +10,7 @@ from jaxtyping import PyTree
 from ._audit import audit
 from ._check import bound_on_steps, check_times, prepare
 from ._controller import controlled, StepController
-from ._failure import check_start, failed_step, select
+from ._selection import check_start, select
 from ._model import make_model
 from ._pace import AbstractPace, EqualSteps, steps_that_fit
 from ._results import first_failure, RESULTS
@@ -181,5 +181,9 @@ def _raise_failure(solution: Solution, reached: Scalar) -> Solution:
         return solution.result.error_if(solution, failed)
     if failed:
         number = int(solution.stats.completed_steps) + 1
-        raise failed_step(solution.result, number, f"at t = {float(reached):.6g}")
+        raise eqx.EquinoxRuntimeError(
+            f"The run failed in step {number}, at t = {float(reached):.6g}. "
+            f"{RESULTS[solution.result]} "
+            "(`throw=False` returns the run up to there.)"
+        )
     return solution

@@ -1,6 +1,5 @@
-"""What a failure does to a run: it stops there, and what follows is not a number."""
+"""Where a run stops, or does not begin: good states are kept, others are no numbers."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
@@ -41,11 +40,3 @@ def check_start(
         fast = rate > 1e2 * tolerance * root * scales.constraint[: rate.size]
         bad = bad | jnp.any(fast)
     return RESULTS.where(bad, RESULTS.inconsistent_start, RESULTS.successful)
-
-
-def failed_step(result: RESULTS, number: int, when: str) -> eqx.EquinoxRuntimeError:
-    """The error of a run whose step `number` has failed."""
-    return eqx.EquinoxRuntimeError(
-        f"The run failed in step {number}, {when}. {RESULTS[result]} "
-        "(`throw=False` returns the run up to there.)"
-    )
