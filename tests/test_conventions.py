@@ -18,7 +18,7 @@ TESTS = sorted(pathlib.Path(__file__).parent.glob("*.py"))
 
 # Each imports only from lower layers: from what stands further up.
 LAYERS = [
-    {"_types", "_tracing", "_fast_loops"},
+    {"_types", "_tracing", "_fast_loops", "_lanes"},
     {"_results"},
     {"_discrete"},
     {"_linear"},
@@ -29,9 +29,9 @@ LAYERS = [
     {"_audit"},
     {"_schemes", "_scaling", "_solution"},
     {"_check"},
-    {"_solve"},
+    *({"_solve"}, {"_divided"}),
     {"_step", "_projection", "_reverse", "_analysis", "_diffrax"},
-    {"_initial", "_selection", "_pace", "_collocation", "_prediction"},
+    {"_initial", "_failure", "_selection", "_pace", "_collocation", "_prediction"},
     {"_controller", "_dense_output"},
     *({name} for name in ("_rows", "_to_time", "_simulate")),
     *({name} for name in ("_measure", "scenes", "problems", "_report", "__main__")),

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from ._lanes import anywhere
 from ._root import ROOT
 
 
@@ -46,8 +47,8 @@ def scans(rows: int, steps: int) -> tuple[Scan, Scan]:
 
 def scan_until(done: Callable[[Any], Array], length: int) -> Scan:
     """A loop of at most `length` steps, over once `done(carry)`: what is left of its
-    segments costs nothing then, and what it hands out there is zero. (In a batch all
-    lanes take all turns.)"""
+    segments costs nothing then, and what it hands out there is zero. In a batch the last
+    lane decides."""
     keep = keep_roots if length <= LONG else _checkpoint
     return functools.partial(_in_segments, keep, math.isqrt(length), done=done)
 
@@ -82,4 +83,5 @@ def _unless(done: Callable[[Any], Array], segment: Body) -> Body:
         _, out = jax.eval_shape(segment, carry, live)
         return carry, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), out)
 
-    return lambda carry, live: jax.lax.cond(done(carry), idle, segment, carry, live)
+    skip = lambda carry: ~anywhere(~done(carry))
+    return lambda carry, live: jax.lax.cond(skip(carry), idle, segment, carry, live)

@@ -5,11 +5,11 @@ from typing import Any, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from ._dense_output import Bracket, state_within
-from ._selection import nan_unless
 from ._model import AbstractModel
+from ._selection import nan_unless
 from ._system import State
 from ._types import Count, Flag, Multipliers, Scalar, Times
 
@@ -20,6 +20,7 @@ class Step(eqx.Module):
     - `reached`: state and multipliers at the end; `None` where no rows are made of them.
     - `details`: what the scheme reports of its own.
     - `energies`: dissipated, work, work of drives; zero for a step that was rejected.
+    - `costs`: iterations, residual and halvings.
     - `passed`: the part of the whole time that has passed at its end.
     """
 
@@ -28,7 +29,7 @@ class Step(eqx.Module):
     energies: PyTree[Float[Array, " steps"]]
     passed: Float[Array, " steps"]
     accepted: Bool[Array, " steps"]
-    iterations: Int[Array, " steps"]
+    costs: PyTree[Array]
 
 
 class Run(eqx.Module):

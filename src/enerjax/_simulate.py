@@ -6,21 +6,21 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ._audit import audit
-from ._check import check_form, positive_integer, prepare
+from ._check import check_form, check_halvings, positive_integer, prepare
 from ._controller import StepController
-from ._selection import check_start, failed_step, nan_unless, select
+from ._failure import raise_failure
 from ._model import make_model
 from ._newton import Newton
 from ._results import first_failure, RESULTS
 from ._reverse import keep_roots, scans
 from ._root import RootFinder
 from ._schemes import AbstractScheme
+from ._selection import check_start, nan_unless, select
 from ._solution import Solution, Statistics
 from ._step import advance, first_warm, Warm
 from ._system import AbstractSystem, State
 from ._to_time import simulate_until
-from ._tracing import is_known
-from ._types import Args, Count, Flag, Real, Scalar, Vector
+from ._types import Args, Count, Flag, Real, Vector
 
 
 class _Carry(eqx.Module):
@@ -47,6 +47,7 @@ def simulate(
     t0: Real = 0.0,
     save_every: int = 1,
     root_finder: RootFinder = Newton(),
+    max_halvings: int | None = None,
     throw: bool = True,
 ) -> Solution:
     """Integrate `num_steps` steps of length `h` from `start`, or until the time `t1`.
@@ -85,6 +86,10 @@ def simulate(
     - `t0`: the time of the start; step `k` begins at `t0 + k h`. Traced.
     - `root_finder`: for the step equations, which are scaled to order one (so tolerances
       are relative); one of optimistix can be given.
+    - `max_halvings`: a step that fails is tried again in 2, 4, up to `2 ** max_halvings`
+      equal parts, in which the laws of the energy hold as in a whole one; 0 for never.
+      Where it is not given: 3 for systems of many unknowns, else 0, for it makes the
+      program longer. `stats.halvings` tells where it was needed.
     - `throw`: raise an error at the end of a run that failed, which names the step, the
       time and the cause (under `jit`, `vmap` and `grad` the cause alone, and for all
       lanes together). With `False` look at `result`: rows after the failure are NaN.
@@ -95,10 +100,21 @@ def simulate(
     `equinox.EquinoxRuntimeError` for a failed run if `throw`.
     """
     check_form(num_steps, save_every, t1, ts, max_steps, controller)
+    check_halvings(max_halvings)
     if num_steps is None:
         times = t0, t1, ts
         return simulate_until(
-            system, scheme, start, args, h, times, max_steps, controller, root_finder, throw
+            system,
+            scheme,
+            start,
+            args,
+            h,
+            times,
+            max_steps,
+            controller,
+            root_finder,
+            max_halvings,
+            throw,
         )
     num_steps = positive_integer("num_steps", num_steps)
     save_every = positive_integer("save_every", save_every)
@@ -107,12 +123,34 @@ def simulate(
             f"`num_steps` ({num_steps}) must be a multiple of `save_every` ({save_every})."
         )
     start, args, h, t0 = prepare(system, scheme, start, args, h, t0, root_finder)
-    solution = _run(system, scheme, start, args, h, t0, root_finder, num_steps, save_every)
-    return _raise_failure(solution, h, t0) if throw else solution
+    solution = _run(
+        system,
+        scheme,
+        start,
+        args,
+        h,
+        t0,
+        root_finder,
+        max_halvings,
+        num_steps,
+        save_every,
+    )
+    return raise_failure(solution, system, args, h, t0) if throw else solution
 
 
 @eqx.filter_jit
-def _run(system, scheme, start, args, h, t0, root_finder, num_steps, save_every):
+def _run(
+    system,
+    scheme,
+    start,
+    args,
+    h,
+    t0,
+    root_finder,
+    max_halvings,
+    num_steps,
+    save_every,
+):
     model = make_model(system, start, args)
     start = model.enter(start)
     acceleration, multipliers0 = model.accelerations(start)
@@ -125,7 +163,7 @@ def _run(system, scheme, start, args, h, t0, root_finder, num_steps, save_every)
     def one_step(carry: _Carry, live: Flag):
         skip = (carry.result != RESULTS.successful) | ~live
         begin = timed(carry.state, carry.completed.astype(h.dtype))
-        out = advance(scheme, model, begin, h, carry.warm, root_finder, skip)
+        out = advance(scheme, model, begin, h, carry.warm, root_finder, skip, max_halvings)
         result = first_failure(carry.result, out.result)
         result = RESULTS.where(live, result, carry.result)
         good = live & (result == RESULTS.successful)
@@ -137,24 +175,27 @@ def _run(system, scheme, start, args, h, t0, root_finder, num_steps, save_every)
         return _Carry(state, memory, result, completed), (
             reported,
             jax.tree.map(lambda x: jnp.where(good, x, 0), energies),
-            jnp.where(skip, 0, out.newton_iterations),
+            jax.tree.map(
+                lambda x: jnp.where(skip, 0, x),
+                (out.newton_iterations, out.residual, out.halvings),
+            ),
         )
 
     num_saves = num_steps // save_every
     scan_of_rows, scan_of_steps = scans(num_saves, save_every)
 
     def one_save(carry: _Carry, live: Flag):
-        carry, (reported, energies, iterations) = scan_of_steps(
+        carry, (reported, energies, costs) = scan_of_steps(
             keep_roots(one_step), carry, jnp.full((save_every,), live)
         )
         last = jax.tree.map(lambda x: x[-1], reported)
         row = (carry.state, *last, jax.tree.map(jnp.sum, energies))
         good = carry.result == RESULTS.successful
-        return carry, (nan_unless(good, row), iterations)
+        return carry, (nan_unless(good, row), costs)
 
     result0 = check_start(scheme, model, start, h)
     begin = _Carry(State(start.q, start.v), warm, result0, jnp.array(0))
-    end, (rows, iterations) = scan_of_rows(one_save, begin, jnp.ones((num_saves,), bool))
+    end, (rows, costs) = scan_of_rows(one_save, begin, jnp.ones((num_saves,), bool))
     states, multipliers, details, energies = rows
     row0 = (begin.state, multipliers0, jax.tree.map(lambda _: jnp.zeros_like(h), energies))
     states, multipliers, energies = jax.tree.map(
@@ -162,6 +203,7 @@ def _run(system, scheme, start, args, h, t0, root_finder, num_steps, save_every)
         row0,
         (states, multipliers, energies),
     )
+    iterations, residuals, halvings = (x.reshape(-1) for x in costs)
     saved = jnp.arange(0, num_steps + 1, save_every, dtype=h.dtype)
     return Solution(
         t0 + h * saved,
@@ -169,18 +211,7 @@ def _run(system, scheme, start, args, h, t0, root_finder, num_steps, save_every)
         multipliers,
         details,
         audit(model, timed(states, saved), *energies),
-        Statistics(iterations.reshape(-1), end.completed),
+        Statistics(iterations, residuals, halvings, end.completed),
+        model.leave(end.state),
         end.result,
     )
-
-
-def _raise_failure(solution: Solution, h: Scalar, t0: Scalar) -> Solution:
-    failed = solution.result != RESULTS.successful
-    if not is_known((failed, solution.stats.completed_steps, h, t0)):
-        return solution.result.error_if(solution, failed)
-    if failed:
-        done = int(solution.stats.completed_steps)
-        begin, end = (float(t0) + k * float(h) for k in (done, done + 1))
-        when = f"from t = {begin:.6g} to {end:.6g}"
-        raise failed_step(solution.result, done + 1, when)
-    return solution

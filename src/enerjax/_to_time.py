@@ -10,7 +10,6 @@ from jaxtyping import PyTree
 from ._audit import audit
 from ._check import bound_on_steps, check_times, prepare
 from ._controller import controlled, StepController
-from ._selection import check_start, select
 from ._model import make_model
 from ._pace import AbstractPace, EqualSteps, steps_that_fit
 from ._results import first_failure, RESULTS
@@ -18,6 +17,7 @@ from ._reverse import keep_roots, scan_until
 from ._root import RootFinder
 from ._rows import at_both_ends, at_steps, at_times, Run, Step
 from ._schemes import AbstractScheme
+from ._selection import check_start, select
 from ._solution import Solution, Statistics
 from ._step import advance, first_warm, Warm
 from ._system import AbstractSystem, State
@@ -53,6 +53,7 @@ def simulate_until(
     max_steps: int | None,
     controller: StepController | None,
     root_finder: RootFinder,
+    max_halvings: int | None,
     throw: bool,
 ) -> Solution:
     """`simulate` with `times = t0, t1, ts`."""
@@ -69,7 +70,18 @@ def simulate_until(
     # Whether alpha is 0 can be seen out here alone.
     order = scheme.order
     solution, reached = _run(
-        system, scheme, start, args, begin, end, rows, pace, root_finder, max_steps, order
+        system,
+        scheme,
+        start,
+        args,
+        begin,
+        end,
+        rows,
+        pace,
+        root_finder,
+        max_halvings,
+        max_steps,
+        order,
     )
     return _raise_failure(solution, reached) if throw else solution
 
@@ -85,6 +97,7 @@ def _run(
     rows: Times | str | None,
     pace: AbstractPace,
     root_finder: RootFinder,
+    max_halvings: int | None,
     max_steps: int,
     order: int,
 ) -> tuple[Solution, Scalar]:
@@ -107,7 +120,7 @@ def _run(
         length = jnp.where(live, length, pace.first())
         begin, h = timed(carry.state, carry.passed), duration * length
         memory = pace.warm(carry.memory, carry.warm, length)
-        out = advance(scheme, model, begin, h, memory, root_finder, ~live)
+        out = advance(scheme, model, begin, h, memory, root_finder, ~live, max_halvings)
         verdict = pace.judge(carry.memory, model, begin, out, h, length)
         good = live & verdict.accepted
         reached = State(out.state.q, out.state.v)
@@ -129,8 +142,9 @@ def _run(
         energies = out.dissipated, out.work, out.drive_work
         energies = jax.tree.map(lambda x: jnp.where(good, x, 0), energies)
         states = None if rows is None else (state, multipliers)
-        iterations = jnp.where(live, out.newton_iterations, 0)
-        return after, Step(states, out.details, energies, passed, good, iterations)
+        costs = out.newton_iterations, out.residual, out.halvings
+        costs = jax.tree.map(lambda x: jnp.where(live, x, 0), costs)
+        return after, Step(states, out.details, energies, passed, good, costs)
 
     whole_start = timed(start, jnp.zeros_like(duration))
     none = jnp.array(0)
@@ -165,7 +179,8 @@ def _run(
         multipliers,
         details,
         audit(model, jax.vmap(timed)(states, passed), *energies),
-        Statistics(steps.iterations, end.completed, rejected),
+        Statistics(*steps.costs, end.completed, rejected),
+        model.leave(end.state),
         result,
     )
     return solution, t0 + duration * end.passed

@@ -76,6 +76,18 @@ def positive_integer(name: str, count: Any) -> int:
     return number
 
 
+def check_halvings(max_halvings: int | None) -> None:
+    """Raises for what is no small number of halvings."""
+    if max_halvings is None:
+        return
+    whole = isinstance(max_halvings, int) and not isinstance(max_halvings, bool)
+    if not whole or not 0 <= max_halvings <= 20:
+        raise ValueError(
+            "`max_halvings` must be an integer from 0 to 20: a step that fails is tried "
+            f"again in up to `2 ** max_halvings` parts. Got {max_halvings!r}."
+        )
+
+
 def check_system(
     system: AbstractSystem, state: State, args: Args, t: Real
 ) -> tuple[State, Args]:

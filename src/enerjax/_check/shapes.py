@@ -26,6 +26,7 @@ _SIGNATURES = dict(
     coordinate_constraint="`(q, args)`",
     force="`(q, v, t, args)`",
     driven="`(q, t, args)`",
+    symmetry="`(q, args)`",
     kinematics="`(q, args)`",
 )
 
@@ -67,6 +68,7 @@ def check_shapes(system: AbstractSystem, state: State, args: Args) -> None:
     _rows("constraint", system.constraint, state.q, args)
     _rows("driven", system.driven, state.q, state.t, args)
     _check_force(system, state, args)
+    _check_symmetry(system, state, args)
     if isinstance(system, System):
         _check_separable(system, state, args)
     elif state.q.size != state.v.size:
@@ -103,6 +105,18 @@ def _check_force(system: AbstractSystem, state: State, args: Args) -> None:
             f"{describe('force', system.force)} returned shape {shape}, but `v` has "
             f"{state.v.size} entries: give one for each, conjugate to it (its power is "
             "`force . v`). A force on a point enters with the Jacobian of the point."
+        )
+
+
+def _check_symmetry(system: AbstractSystem, state: State, args: Args) -> None:
+    if system.symmetry is None:
+        return
+    shape = _shape("symmetry", system.symmetry, state.q, args)
+    if len(shape) != 2 or shape[1] != state.v.size:
+        raise ValueError(
+            f"{describe('symmetry', system.symmetry)} returned shape {shape}: give one row "
+            f"of {state.v.size} velocities for each symmetry. A single one is "
+            "`velocities[None]`."
         )
 
 

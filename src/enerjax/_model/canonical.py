@@ -61,6 +61,9 @@ class CanonicalModel(AbstractModel):
     def lift(self, q: Coordinates, v: Velocities) -> Coordinates:
         return self.system.hamiltonian_and_rate(q, v, self.args)[1]
 
+    def momentum(self, state: State) -> Velocities:
+        return state.v
+
     def gradient(self, state: State, h: Scalar) -> Drive:
         force, rate = jax.grad(self.hamiltonian, argnums=(0, 1))(state.q, state.v)
         return Drive(h * force, rate)

@@ -91,6 +91,9 @@ class SeparableModel(AbstractModel):
     def _potential(self, q: Coordinates) -> Scalar:
         return self.system.potential(q, self.args)
 
+    def momentum(self, state: State) -> Velocities:
+        return self.inertia @ state.v
+
     def gradient(self, state: State, h: Scalar) -> Drive:
         return Drive(h * jax.grad(self._potential)(state.q), jnp.zeros((0,), h.dtype))
 

@@ -47,6 +47,8 @@ def inexact(x: Any) -> Array:
 # `force(q, v, t, args)` and `driven(q, t, args)`.
 Force: TypeAlias = Callable[[Coordinates, Velocities, Scalar, Args], Velocities]
 Driven: TypeAlias = Callable[[Coordinates, Scalar, Args], JointMultipliers]
+# `symmetry(q, args)`.
+Symmetry: TypeAlias = Callable[[Coordinates, Args], Float[Array, "ns nv"]]
 
 
 class State(eqx.Module):
@@ -71,6 +73,7 @@ class AbstractSystem(eqx.Module):
     constraint: eqx.AbstractVar[Callable[[Coordinates, Args], Multipliers] | None]
     force: eqx.AbstractVar[Force | None]
     driven: eqx.AbstractVar[Driven | None]
+    symmetry: eqx.AbstractVar[Symmetry | None]
     redundant: eqx.AbstractVar[bool]
 
     @property
