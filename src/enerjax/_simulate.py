@@ -79,8 +79,8 @@ def simulate(
       `max_steps`.
     - `max_steps`: with `t1`, a bound on the steps, rejected ones included; a run that
       needs more fails. Without it the number of steps where it is known, and with a
-      controller 4096. Steps that are left cost nothing, but in a batch all lanes take
-      part in all of them.
+      controller 4096. Steps that are left cost nothing; of a batch those after its last
+      lane.
     - `controller`: with `t1`, a `StepController` that varies the steps; `h` is the first.
       Derivatives are those of the steps as they were chosen, as parts of `t1 - t0`.
     - `t0`: the time of the start; step `k` begins at `t0 + k h`. Traced.
