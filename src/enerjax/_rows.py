@@ -75,9 +75,11 @@ def at_both_ends(run: Run, end: PyTree[Any], failed: Flag) -> Rows:
 
 def _completed(run: Run) -> tuple[Step, Bool[Array, " steps"]]:
     """The steps that were accepted, first, and which they are."""
-    order = jnp.argsort(~run.steps.accepted, stable=True)
+    numbers = jnp.arange(run.steps.accepted.size)
+    order = jnp.searchsorted(jnp.cumsum(run.steps.accepted), numbers + 1)
+    order = jnp.minimum(order, numbers.size - 1)
     steps = jax.tree.map(lambda x: x[order], run.steps)
-    return steps, jnp.arange(order.size) < run.completed
+    return steps, numbers < run.completed
 
 
 def _mask(valid: Bool[Array, " rows"], tree: PyTree[Any]) -> PyTree[Any]:
