@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import enerjax as ej
-from enerjax._collocation import rates
-from enerjax._controller import other_end
 from enerjax._model import make_model
+from enerjax._run.collocation import rates
+from enerjax._run.controller import other_end
 
 from .helpers import problem
 from .references import double_pendulum_reference

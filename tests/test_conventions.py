@@ -30,10 +30,8 @@ LAYERS = [
     {"_schemes", "_scaling", "_solution"},
     {"_check"},
     *({"_solve"}, {"_divided"}),
-    {"_step", "_projection", "_reverse", "_analysis", "_diffrax"},
-    {"_initial", "_failure", "_selection", "_pace", "_collocation", "_prediction"},
-    {"_controller", "_dense_output"},
-    *({name} for name in ("_rows", "_to_time", "_simulate")),
+    {"_step", "_projection", "_analysis", "_diffrax"},
+    {"_initial", "_run"},
     *({name} for name in ("_measure", "scenes", "problems", "_report", "__main__")),
 ]
 LAYER = {name: number for number, names in enumerate(LAYERS) for name in names}
@@ -115,7 +113,7 @@ def test_schemes_know_no_solver():
 
 
 def test_the_run_knows_no_scheme_by_name():
-    for name in ("_step", "_to_time", "_simulate", "_check", "_scaling"):
+    for name in ("_step", "_run", "_check", "_scaling"):
         for path in files_of(name):
             for module, names in imports(path):
                 if module.startswith("enerjax._schemes"):

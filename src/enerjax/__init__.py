@@ -10,7 +10,6 @@ from ._analysis import (
     modes as modes,
 )
 from ._audit import Audit as Audit
-from ._controller import StepController as StepController
 from ._diffrax import IndexReduced as IndexReduced, to_diffrax as to_diffrax
 from ._discrete import (
     AbstractDerivative as AbstractDerivative,
@@ -37,6 +36,7 @@ from ._measure import (
 )
 from ._newton import Newton as Newton
 from ._results import RESULTS as RESULTS
+from ._run import simulate as simulate, StepController as StepController
 from ._schemes import (
     AbstractScheme as AbstractScheme,
     Composed as Composed,
@@ -47,7 +47,6 @@ from ._schemes import (
     KappaDecaying as KappaDecaying,
     Rattle as Rattle,
 )
-from ._simulate import simulate as simulate
 from ._solution import Solution as Solution, Statistics as Statistics
 from ._step import step as step, StepOutput as StepOutput, Warm as Warm
 from ._system import (

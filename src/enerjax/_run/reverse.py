@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from ._lanes import anywhere
-from ._root import ROOT
+from .._lanes import anywhere
+from .._root import ROOT
 
 
 # Steps beyond which the roots are not kept.

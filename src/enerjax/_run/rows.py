@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from ._dense_output import Bracket, state_within
-from ._model import AbstractModel
-from ._selection import nan_unless
-from ._system import State
-from ._types import Count, Flag, Multipliers, Scalar, Times
+from .._model import AbstractModel
+from .._system import State
+from .._types import Count, Flag, Multipliers, Scalar, Times
+from .dense_output import Bracket, state_within
+from .selection import nan_unless
 
 
 class Step(eqx.Module):

@@ -8,17 +8,17 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from ._collocation import end_of, Pair, rates, rates_along
-from ._model import AbstractModel
-from ._pace import AbstractPace, Verdict
-from ._prediction import for_length, with_history
-from ._results import RESULTS
-from ._root import ROOT
-from ._schemes import AbstractCarryingSolve, AbstractScheme
-from ._step import StepOutput, Warm
-from ._system import State
-from ._tracing import is_known
-from ._types import Count, Flag, Real, Scalar
+from .._model import AbstractModel
+from .._results import RESULTS
+from .._root import ROOT
+from .._schemes import AbstractCarryingSolve, AbstractScheme
+from .._step import StepOutput, Warm
+from .._system import State
+from .._tracing import is_known
+from .._types import Count, Flag, Real, Scalar
+from .collocation import end_of, Pair, rates, rates_along
+from .pace import AbstractPace, Verdict
+from .prediction import for_length, with_history
 
 
 def _as_tolerance(tolerance: Real) -> Scalar:

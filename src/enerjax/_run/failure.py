@@ -2,31 +2,41 @@
 
 import equinox as eqx
 
-from ._analysis import mobility
-from ._results import RESULTS
-from ._solution import Solution
-from ._system import AbstractSystem
-from ._tracing import is_known
-from ._types import Args, Scalar
+from .._analysis import mobility
+from .._results import RESULTS
+from .._solution import Solution
+from .._system import AbstractSystem
+from .._tracing import is_known
+from .._types import Args, Scalar
 
 
 def raise_failure(
-    solution: Solution, system: AbstractSystem, args: Args, h: Scalar, t0: Scalar
+    solution: Solution,
+    system: AbstractSystem,
+    args: Args,
+    reached: Scalar,
+    h: Scalar | None = None,
 ) -> Solution:
-    """The solution, if it is one; else an error that names step, time, cause and remedy."""
+    """The solution, if it is one; else an error that names step, time, cause and remedy.
+
+    `reached` is the time that the run has come to, `h` the length of its steps if they have
+    one.
+    """
     failed = solution.result != RESULTS.successful
-    if not is_known((solution, args, h, t0)):
+    if not is_known((solution, args, reached, h)):
         return solution.result.error_if(solution, failed)
     if not failed:
         return solution
     done = int(solution.stats.completed_steps)
-    begin, end = (float(t0) + k * float(h) for k in (done, done + 1))
-    message = (
-        f"The run failed in step {done + 1}, from t = {begin:.6g} to {end:.6g}. "
-        f"{RESULTS[solution.result]} "
-    )
+    begin = float(reached)
+    when = f"at t = {begin:.6g}"
+    if h is not None:
+        when = f"from t = {begin:.6g} to {begin + float(h):.6g}"
+    message = f"The run failed in step {done + 1}, {when}. {RESULTS[solution.result]} "
     if solution.result == RESULTS.not_converged:
-        residual = float(solution.stats.residual[done])
+        rejected = solution.stats.rejected_steps
+        tried = done if rejected is None else done + int(rejected) - 1
+        residual = float(solution.stats.residual[tried])
         message += f"It came to a residual of {residual:.1e}, scaled to order one. "
     if solution.result in (RESULTS.not_converged, RESULTS.singular):
         message += _dependent_rows(system, solution, args, begin)

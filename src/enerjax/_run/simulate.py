@@ -5,22 +5,22 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ._audit import audit
-from ._check import check_form, check_halvings, positive_integer, prepare
-from ._controller import StepController
-from ._failure import raise_failure
-from ._model import make_model
-from ._newton import Newton
-from ._results import first_failure, RESULTS
-from ._reverse import keep_roots, scans
-from ._root import RootFinder
-from ._schemes import AbstractScheme
-from ._selection import check_start, nan_unless, select
-from ._solution import Solution, Statistics
-from ._step import advance, first_warm, Warm
-from ._system import AbstractSystem, State
-from ._to_time import simulate_until
-from ._types import Args, Count, Flag, Real, Vector
+from .._audit import audit
+from .._check import check_form, check_halvings, positive_integer, prepare
+from .._model import make_model
+from .._newton import Newton
+from .._results import first_failure, RESULTS
+from .._root import RootFinder
+from .._schemes import AbstractScheme
+from .._solution import Solution, Statistics
+from .._step import advance, first_warm, Warm
+from .._system import AbstractSystem, State
+from .._types import Args, Count, Flag, Real, Vector
+from .controller import StepController
+from .failure import raise_failure
+from .reverse import keep_roots, scans
+from .selection import check_start, nan_unless, select
+from .to_time import simulate_until
 
 
 class _Carry(eqx.Module):
@@ -135,7 +135,10 @@ def simulate(
         num_steps,
         save_every,
     )
-    return raise_failure(solution, system, args, h, t0) if throw else solution
+    if not throw:
+        return solution
+    reached = t0 + h * solution.stats.completed_steps.astype(h.dtype)
+    return raise_failure(solution, system, args, reached, h)
 
 
 @eqx.filter_jit

@@ -4,11 +4,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ._collocation import end_of, integral, rates, rates_along
-from ._model import AbstractModel
-from ._projection import project_position, project_velocity
-from ._system import State
-from ._types import Scalar
+from .._model import AbstractModel
+from .._projection import project_position, project_velocity
+from .._system import State
+from .._types import Scalar
+from .collocation import end_of, integral, rates, rates_along
 
 
 class Bracket(eqx.Module):

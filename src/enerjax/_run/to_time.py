@@ -7,22 +7,22 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from ._audit import audit
-from ._check import bound_on_steps, check_times, prepare
-from ._controller import controlled, StepController
-from ._model import make_model
-from ._pace import AbstractPace, EqualSteps, steps_that_fit
-from ._results import first_failure, RESULTS
-from ._reverse import keep_roots, scan_until
-from ._root import RootFinder
-from ._rows import at_both_ends, at_steps, at_times, Run, Step
-from ._schemes import AbstractScheme
-from ._selection import check_start, select
-from ._solution import Solution, Statistics
-from ._step import advance, first_warm, Warm
-from ._system import AbstractSystem, State
-from ._tracing import is_known
-from ._types import Args, Count, Flag, Multipliers, Real, Scalar, Times
+from .._audit import audit
+from .._check import bound_on_steps, check_times, prepare
+from .._model import make_model
+from .._results import first_failure, RESULTS
+from .._root import RootFinder
+from .._schemes import AbstractScheme
+from .._solution import Solution, Statistics
+from .._step import advance, first_warm, Warm
+from .._system import AbstractSystem, State
+from .._types import Args, Count, Flag, Multipliers, Real, Scalar, Times
+from .controller import controlled, StepController
+from .failure import raise_failure
+from .pace import AbstractPace, EqualSteps, steps_that_fit
+from .reverse import keep_roots, scan_until
+from .rows import at_both_ends, at_steps, at_times, Run, Step
+from .selection import check_start, select
 
 
 class _Carry(eqx.Module):
@@ -83,7 +83,7 @@ def simulate_until(
         max_steps,
         order,
     )
-    return _raise_failure(solution, reached) if throw else solution
+    return raise_failure(solution, system, args, reached) if throw else solution
 
 
 @eqx.filter_jit
@@ -188,17 +188,3 @@ def _run(
 
 def _done(carry: _Carry) -> Flag:
     return (carry.result != RESULTS.successful) | (carry.passed >= 1)
-
-
-def _raise_failure(solution: Solution, reached: Scalar) -> Solution:
-    failed = solution.result != RESULTS.successful
-    if not is_known((failed, solution.stats.completed_steps, reached)):
-        return solution.result.error_if(solution, failed)
-    if failed:
-        number = int(solution.stats.completed_steps) + 1
-        raise eqx.EquinoxRuntimeError(
-            f"The run failed in step {number}, at t = {float(reached):.6g}. "
-            f"{RESULTS[solution.result]} "
-            "(`throw=False` returns the run up to there.)"
-        )
-    return solution

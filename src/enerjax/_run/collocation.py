@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._model import AbstractModel, Time
-from ._system import State
-from ._types import Coordinates, Scalar, Velocities
+from .._model import AbstractModel, Time
+from .._system import State
+from .._types import Coordinates, Scalar, Velocities
 
 
 # Positions and velocities (or momenta), or their rates of change.
