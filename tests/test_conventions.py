@@ -33,7 +33,7 @@ LAYERS = [
     {"_step", "_projection", "_reverse", "_analysis", "_diffrax"},
     {"_initial"},
     {"_simulate"},
-    {"_measure"},
+    {"_measure", "_sweep"},
     {"scenes"},
     {"problems"},
     {"_report"},

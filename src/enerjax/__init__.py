@@ -49,6 +49,7 @@ from ._schemes import (
 from ._simulate import simulate as simulate
 from ._solution import Solution as Solution, Statistics as Statistics
 from ._step import step as step, StepOutput as StepOutput, Warm as Warm
+from ._sweep import Sweep as Sweep, sweep as sweep
 from ._system import (
     AbstractSystem as AbstractSystem,
     Elements as Elements,
