@@ -31,13 +31,10 @@ LAYERS = [
     {"_check"},
     {"_solve"},
     {"_step", "_projection", "_reverse", "_analysis", "_diffrax"},
-    {"_initial"},
-    {"_simulate"},
-    {"_measure", "_sweep"},
-    {"scenes"},
-    {"problems"},
-    {"_report"},
-    {"__main__"},
+    {"_initial", "_failure", "_pace", "_collocation", "_prediction"},
+    {"_controller", "_dense_output"},
+    *({name} for name in ("_rows", "_to_time", "_simulate")),
+    *({name} for name in ("_measure", "_sweep", "scenes", "problems", "_report", "__main__")),
 ]
 LAYER = {name: number for number, names in enumerate(LAYERS) for name in names}
 
@@ -118,7 +115,7 @@ def test_schemes_know_no_solver():
 
 
 def test_the_run_knows_no_scheme_by_name():
-    for name in ("_step", "_simulate", "_check", "_scaling"):
+    for name in ("_step", "_to_time", "_simulate", "_check", "_scaling"):
         for path in files_of(name):
             for module, names in imports(path):
                 if module.startswith("enerjax._schemes"):

@@ -10,6 +10,7 @@ from ._analysis import (
     modes as modes,
 )
 from ._audit import Audit as Audit
+from ._controller import StepController as StepController
 from ._diffrax import IndexReduced as IndexReduced, to_diffrax as to_diffrax
 from ._discrete import (
     AbstractDerivative as AbstractDerivative,

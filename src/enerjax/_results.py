@@ -32,6 +32,16 @@ class RESULTS(eqx.Enumeration):
         "more. This is a limit of the scheme, not of the step: use `EnergyDecaying` or "
         "`EnergyConsistent`."
     )
+    out_of_steps = (
+        "The end time is not reached within `max_steps`. Raise `max_steps`, lengthen `h`, "
+        "or loosen the tolerances of the controller."
+    )
+    steps_too_short = (
+        "The tolerances of the controller ask for steps that vanish beside the length of "
+        "the run. Loosen `rtol` and `atol`: what Newton's method leaves, about 1e-14 of "
+        "the coordinates, is not below any tolerance; or the motion has a singularity "
+        "here (a collision)."
+    )
 
 
 def first_failure(old: RESULTS, new: RESULTS) -> RESULTS:

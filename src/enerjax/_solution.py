@@ -14,10 +14,16 @@ class Statistics(eqx.Module):
 
     - `newton_iterations`: of each step, shape `(num_steps,)`; 0 after a failure.
     - `completed_steps`: number of steps before the first failure, or all.
+    - `rejected_steps`: of a run with a `StepController`, how many steps were repeated with
+      another length, the last one of a failed run included; else `None`.
+
+    In a run to an end time there is room for `max_steps`; with a controller rejected steps
+    count and stand among the others.
     """
 
     newton_iterations: Int[Array, " steps"]
     completed_steps: Count
+    rejected_steps: Count | None = None
 
 
 class Solution(eqx.Module):

@@ -3,3 +3,8 @@ from .inputs import (
     positive_integer as positive_integer,
     prepare as prepare,
 )
+from .times import (
+    bound_on_steps as bound_on_steps,
+    check_form as check_form,
+    check_times as check_times,
+)
