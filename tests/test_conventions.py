@@ -34,7 +34,18 @@ LAYERS = [
     {"_initial", "_failure", "_pace", "_collocation", "_prediction"},
     {"_controller", "_dense_output"},
     *({name} for name in ("_rows", "_to_time", "_simulate")),
-    *({name} for name in ("_measure", "_sweep", "scenes", "problems", "_report", "__main__")),
+    *(
+        {name}
+        for name in (
+            "_measure",
+            "_sweep",
+            "_identify",
+            "scenes",
+            "problems",
+            "_report",
+            "__main__",
+        )
+    ),
 ]
 LAYER = {name: number for number, names in enumerate(LAYERS) for name in names}
 

@@ -23,6 +23,11 @@ from ._discrete import (
     MeanValue as MeanValue,
 )
 from ._fast_loops import enable_fast_loops as enable_fast_loops
+from ._identify import (
+    Fit as Fit,
+    fit as fit,
+    multiple_shooting as multiple_shooting,
+)
 from ._initial import (
     consistent_start as consistent_start,
     ConsistentStart as ConsistentStart,
