@@ -100,13 +100,14 @@ def covariance(
     """`variance (J^T J)^-1`, and which parameters the rows of `J` do not determine."""
     size = jnp.linalg.norm(jacobian, axis=0)
     scale = jnp.where(size > 0, size, 1)
-    _, values, directions = jnp.linalg.svd(jacobian / scale, full_matrices=False)
+    _, values, directions = jnp.linalg.svd(jacobian / scale[None], full_matrices=False)
     eps = jnp.finfo(jacobian.dtype).eps
     # Derivatives of a run have about this accuracy, whatever their size.
     silent = values <= jnp.sqrt(eps) * values[0]
-    weak = (silent @ directions**2 > jnp.sqrt(eps)) | (size == 0)
+    unseen = jnp.sum(jnp.where(silent[:, None], directions**2, 0), axis=0)
+    weak = (unseen > jnp.sqrt(eps)) | (size == 0)
     inverse = jnp.where(silent, 0, 1 / jnp.where(silent, 1, values))
-    root = directions.T * inverse / scale[:, None]
+    root = directions.T * inverse[None] / scale[:, None]
     return variance * root @ root.T, weak
 
 

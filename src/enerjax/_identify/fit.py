@@ -119,7 +119,7 @@ def _fit(residuals, unknowns, numbers, data, solver, max_steps, guess):
         unknowns.unravel(slopes * error),
         unknowns.parameters(x - half),
         unknowns.parameters(x + half),
-        slopes[:, None] * spread * slopes,
+        slopes[:, None] * spread * slopes[None],
         cost,
         iterations,
         iterations * each + x.size + 1,
