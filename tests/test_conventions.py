@@ -32,7 +32,8 @@ LAYERS = [
     *({"_solve"}, {"_divided"}),
     {"_step", "_projection", "_analysis", "_diffrax"},
     {"_initial", "_run"},
-    *({name} for name in ("_measure", "scenes", "problems", "_report", "__main__")),
+    *({"_measure"}, {"_sweep"}, {"_identify"}),
+    *({name} for name in ("scenes", "problems", "_report", "__main__")),
 ]
 LAYER = {name: number for number, names in enumerate(LAYERS) for name in names}
 
