@@ -11,6 +11,11 @@ from ._system import State
 from ._types import Scalar
 
 
+# What Newton may try to resolve of that round-off. It stops where corrections no longer
+# shrink; a floor at the round-off itself would let stiff springs stop it before.
+_BEYOND = 0.01
+
+
 def scales_like(
     z: PyTree[Any], model: AbstractModel, start: State, h: Scalar
 ) -> tuple[PyTree[Any], PyTree[Any]]:
@@ -43,8 +48,8 @@ def scales_like(
         # A constraint is a difference of numbers that can be large against what a step
         # changes: its rows are resolved to the round-off of those.
         position = root * scales.constraint + scales.constraint_size / jnp.abs(h)
-        # So are those of the momenta to the round-off of the terms of the forces.
-        momentum = jnp.maximum(root * scales.coordinate, forces)
+        # Those of the momenta not much beyond the round-off of the terms of the forces.
+        momentum = jnp.maximum(root * scales.coordinate, _BEYOND * forces)
         rate = (root / scales.coordinate)[: x.momentum.size]
         return Increment(momentum, rate, position[: x.impulse.size], root * joint)
 
