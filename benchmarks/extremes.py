@@ -104,7 +104,10 @@ def main(arguments: list[str] | None = None) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_enable_x64", True)
     rows = []
-    for name, rows_of in axes(options.quick, options.long).items():
+    chosen = axes(options.quick, options.long)
+    if options.only not in (None, *chosen):
+        parser.error(f"--only must be one of {', '.join(chosen)}")
+    for name, rows_of in chosen.items():
         if options.only not in (None, name):
             continue
         begin = time.perf_counter()

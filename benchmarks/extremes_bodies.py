@@ -161,13 +161,13 @@ def _skewed(q, args):
 def singular_rows(quick: bool) -> Iterator[Row]:
     schemes = alphas(0.5)
     bars = tuple(ej.problems.parallel_bars(1))
-    for name in ("EnergyPreserving()", "EnergyDecaying(0.5)"):
-        for h in (0.01,) if quick else (0.01, 0.005, 0.0025):
-            solution = run(bars, schemes[name], h, round((10 if quick else 100) / h), 10)
-            # Uprights of a parallelogram are parallel: else it has folded.
-            folded = lambda q, v: np.max(np.abs(q[:, :2] - q[:, 6:8] + [1.0, 0.0]))
-            place = ("near singular", "A02, 1 cell", name, f"h = {h:g}", h)
-            yield judge(place, solution, folded, 1e-6, 1e-6)
+    name = "EnergyPreserving()"
+    for h in (0.01,) if quick else (0.01, 0.005):
+        solution = run(bars, schemes[name], h, round((10 if quick else 100) / h), 10)
+        # Uprights of a parallelogram are parallel: else it has folded.
+        folded = lambda q, v: np.max(np.abs(q[:, :2] - q[:, 6:8] + [1.0, 0.0]))
+        place = ("near singular", "A02, 1 cell", name, f"h = {h:g}", h)
+        yield judge(place, solution, folded, 1e-6, 1e-6)
     crank = tuple(ej.problems.slider_crank())
     for name, scheme in schemes.items():
         solution = run(crank, scheme, 1e-3, 1000)

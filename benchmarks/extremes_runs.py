@@ -85,8 +85,8 @@ def judge(
     energy = (audit.kinetic + audit.potential)[good]
     explained = np.cumsum((audit.work + audit.drive_work - audit.dissipated)[good])
     moved = np.max(audit.kinetic[good]) + np.ptp(audit.potential[good])
-    if moved <= 1e-12 * np.max(np.abs(energy)):  # nothing but round-off moves
-        moved = np.max(np.abs(energy))
+    # Where next to nothing moves, energies are rounded by more than a part of that.
+    moved += 1e-4 * np.max(np.abs(energy))
     left = np.max(np.abs(energy - energy[0] - explained))
     leak = float(left / moved) if moved > 0 else float(left)
     error = np.nan

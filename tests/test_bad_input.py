@@ -8,7 +8,8 @@ import pytest
 
 import enerjax as ej
 
-from .bad_inputs import ARGS, BAD, kinetic, potential, rod, simulate, WRONG_TYPES
+from .bad_functions import ARGS, kinetic, potential, rod, simulate
+from .bad_inputs import BAD, WRONG_TYPES
 
 
 def test_the_input_that_the_others_spoil_is_good():
