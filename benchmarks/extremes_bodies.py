@@ -1,6 +1,7 @@
 """Bodies and joints: masses, sizes, places, rest, whips, singular poses, long runs."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,12 @@ from extremes_runs import alphas, judge, Row, run, Vector
 from scipy.integrate import solve_ivp
 
 import enerjax as ej
+
+
+def _plain(problem: ej.problems.Problem) -> tuple[ej.System, ej.State, Any]:
+    system, start, args = problem
+    assert isinstance(system, ej.System)
+    return system, start, args
 
 
 def _rates(m1: float, m2: float, g: float = 9.81):
@@ -37,10 +44,9 @@ def exact(start: tuple[float, float], m1: float, m2: float, t: float) -> Vector:
     """The points at `t`, released at rest."""
     # Light masses on a straight start are carried along: stiff for an explicit method.
     light = min(m1, m2) < 1e-4 * max(m1, m2) and start[0] == start[1]
-    method = dict(method="Radau", rtol=1e-11, atol=1e-12) if light else dict(
-        method="DOP853", rtol=1e-13, atol=1e-14
-    )  # fmt: skip
-    y = solve_ivp(_rates(m1, m2), (0, t), [*start, 0.0, 0.0], **method).y[:, -1]
+    method, rtol, atol = ("Radau", 1e-11, 1e-12) if light else ("DOP853", 1e-13, 1e-14)
+    begin, rates = [*start, 0.0, 0.0], _rates(m1, m2)
+    y = solve_ivp(rates, (0, t), begin, method=method, rtol=rtol, atol=atol).y[:, -1]
     return _points(y[:2])
 
 
@@ -78,13 +84,13 @@ def _rods(q, args):
 
 
 def size_rows(quick: bool) -> Iterator[Row]:
-    base, _, args = ej.problems.double_pendulum()
+    base = _plain(ej.problems.double_pendulum())[0]
     system = ej.System(base.kinetic, base.potential, _rods)
     h, steps, unit = 0.01, 50, np.array([1.0, 0.0, 1.0, 1.0])
     scales = {"length": (1e-9, 1e9), "mass": (1e-12, 1e12), "time": (1e-9, 1e9)}
     for name, scheme in alphas(0.5).items():
 
-        def at(length=1.0, mass=1.0, time=1.0, place=0.0, scheme=scheme):
+        def at(length=1.0, mass=1.0, time=1.0, place=0.0, *, scheme=scheme):
             numbers = dict(m1=mass, m2=mass, l1=length, l2=length)
             numbers |= dict(g=9.81 * length / time**2, at=place)
             start = ej.State(length * unit + place, np.zeros(4))
@@ -100,7 +106,8 @@ def size_rows(quick: bool) -> Iterator[Row]:
                 row = ("size and place", kind, name, f"{value:g}", value)
                 length = value if kind == "length" else 1.0
                 error_of = lambda q, v, l=length, o=one: np.max(np.abs(q / l - o.ys.q))
-                yield judge(row, at(**{kind: value}), error_of, 1e-10)
+                numbers: dict[str, Any] = {kind: value}
+                yield judge(row, at(**numbers), error_of, 1e-10)
         for value in (1e4, 1e8):
             row = ("size and place", "offset", name, f"{value:g}", value)
             error_of = lambda q, v, x=value, o=one: np.max(np.abs(q - x - o.ys.q))
@@ -146,9 +153,9 @@ def whip_rows(quick: bool) -> Iterator[Row]:
     schemes: dict[str, ej.AbstractScheme] = {"EnergyPreserving()": ej.EnergyPreserving()}
     if not quick:
         schemes["EnergyConsistent(0.5)"] = ej.EnergyConsistent(0.5)
-    problem = ej.problems.chain(links)
+    problem = _plain(ej.problems.chain(links))
     for name, scheme in schemes.items():
-        solution = run(tuple(problem), scheme, 1e-3, steps)
+        solution = run(problem, scheme, 1e-3, steps)
         place = ("whip", f"{links} links", name, "h = 1e-3 to 1.5 s", float(links))
         yield judge(place, solution)
 
@@ -160,7 +167,7 @@ def _skewed(q, args):
 
 def singular_rows(quick: bool) -> Iterator[Row]:
     schemes = alphas(0.5)
-    bars = tuple(ej.problems.parallel_bars(1))
+    bars = _plain(ej.problems.parallel_bars(1))
     name = "EnergyPreserving()"
     for h in (0.01,) if quick else (0.01, 0.005):
         solution = run(bars, schemes[name], h, round((10 if quick else 100) / h), 10)
@@ -168,7 +175,7 @@ def singular_rows(quick: bool) -> Iterator[Row]:
         folded = lambda q, v: np.max(np.abs(q[:, :2] - q[:, 6:8] + [1.0, 0.0]))
         place = ("near singular", "A02, 1 cell", name, f"h = {h:g}", h)
         yield judge(place, solution, folded, 1e-6, 1e-6)
-    crank = tuple(ej.problems.slider_crank())
+    crank = _plain(ej.problems.slider_crank())
     for name, scheme in schemes.items():
         solution = run(crank, scheme, 1e-3, 1000)
         place = ("near singular", "slider-crank, 12 dead centres", name, "h = 1e-3", 1e-3)
@@ -177,7 +184,7 @@ def singular_rows(quick: bool) -> Iterator[Row]:
 
 
 def _repeated_rows(schemes: dict[str, ej.AbstractScheme]) -> Iterator[Row]:
-    single, start, args = ej.problems.pendulum()
+    single, start, args = _plain(ej.problems.pendulum())
     for redundant in (False, True):
         system = ej.System(single.kinetic, single.potential, _skewed, redundant=redundant)
         for name, scheme in schemes.items():
@@ -207,7 +214,7 @@ def length_rows(quick: bool, long: bool) -> Iterator[Row]:
     ):
         for name, scheme in schemes.items():
             count = steps // share
-            solution = run(tuple(problem), scheme, h, count, count // 1000)
+            solution = run(_plain(problem), scheme, h, count, count // 1000)
             slope = exponent(np.asarray(solution.audit.energy))
             place = ("length of run", case, name, f"{count:.0e} steps", float(count))
             # The statistics of a thousand rows.

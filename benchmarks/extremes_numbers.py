@@ -75,8 +75,8 @@ def step_rows(quick: bool) -> Iterator[Row]:
             yield judge(place, solution, error_of, 1e-10)
             if x >= 1e4:
                 place = ("step", "amplification", name, f"h omega = {x:g}", x)
-                rho = 1.0 if isinstance(scheme, ej.EnergyPreserving) else None
-                rho = rho or (1 - scheme.alpha) / (1 + scheme.alpha)
+                alpha = alpha_of(scheme) or 0.0
+                rho = (1 - alpha) / (1 + alpha)
                 size = lambda q, v, x=x: np.hypot(q[:, 0], v[:, 0] / x)
                 error_of = lambda q, v, rho=rho, size=size: abs(size(q, v)[1] - rho)
                 # Truncation in 1/(h omega).

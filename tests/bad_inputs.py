@@ -101,6 +101,7 @@ WRONG_TYPES = (
     "scheme a name",
     "potential not a function",
     "constraint not a function",
+    "inertia a vector",
     "q in half precision",
     "h a string",
     "h forgotten",

@@ -57,7 +57,7 @@ def prepare(
             "the scheme inside `jax.vmap`."
         )
     _check_number("h", h)
-    if is_known(h) and np.ndim(h) == 0 and not 0 < float(h) < np.inf:
+    if is_known(h) and np.ndim(h) == 0 and not 0 < float(np.real(h)) < np.inf:
         raise ValueError(f"`h` must be positive and finite, got {h}.")
     h = jnp.asarray(h, start.q.dtype)
     if h.ndim != 0:
