@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from .._kinematics import ConfigurationKinematics
@@ -47,7 +48,7 @@ def _shape(role: str, fn: Callable, *inputs: Any) -> tuple[int, ...]:
         ) from None
     except ValueError:  # no signature to be had
         pass
-    out = eqx.filter_eval_shape(fn, *inputs)
+    out = _traced(role, fn, *inputs)
     if not hasattr(out, "shape") or not jnp.issubdtype(out.dtype, jnp.floating):
         kind = out.dtype if hasattr(out, "dtype") else f"a Python {type(out).__name__}"
         raise TypeError(
@@ -55,6 +56,32 @@ def _shape(role: str, fn: Callable, *inputs: Any) -> tuple[int, ...]:
             "with `jax.numpy` from its arguments: `0.0 * q[0]` is a zero of the right kind."
         )
     return out.shape
+
+
+def _traced(role: str, fn: Callable, *inputs: Any) -> Any:
+    """The kind of value that a function returns, and in its name what it raises."""
+    try:
+        return eqx.filter_eval_shape(fn, *inputs)
+    except (
+        jax.errors.ConcretizationTypeError,
+        jax.errors.TracerArrayConversionError,
+        jax.errors.TracerIntegerConversionError,
+    ) as error:
+        raise TypeError(
+            f"{describe(role, fn)} asks for the value of a number that is traced. Write it "
+            "with `jax.numpy`, not `math` or `numpy`, and `jnp.where` instead of `if`."
+        ) from error
+    except Exception as error:
+        raise ValueError(
+            f"{describe(role, fn)} raised {type(error).__name__}: {error}. It is called "
+            f"with {_SIGNATURES[role]}, and `args` is {_kind(inputs[-1])} here."
+        ) from error
+
+
+def _kind(args: Any) -> str:
+    if isinstance(args, dict):
+        return f"a dictionary with the keys {sorted(map(str, args))}"
+    return "None" if args is None else f"of type {type(args).__name__}"
 
 
 def check_shapes(system: AbstractSystem, state: State, args: Args) -> None:
@@ -65,8 +92,14 @@ def check_shapes(system: AbstractSystem, state: State, args: Args) -> None:
                 f"{describe(role, fn)} must return a scalar, an energy, got shape {shape}."
                 + (" Sum over the bodies, or index the entry." if shape else "")
             )
-    _rows("constraint", system.constraint, state.q, args)
-    _rows("driven", system.driven, state.q, state.t, args)
+    rows = _rows("constraint", system.constraint, state.q, args)
+    rows += _rows("driven", system.driven, state.q, state.t, args)
+    if rows > state.q.size and not system.redundant:
+        raise ValueError(
+            f"{rows} constraints of {state.q.size} coordinates cannot be independent. "
+            "Leave out those that follow from the others, or declare "
+            "`System(..., redundant=True)`."
+        )
     _check_force(system, state, args)
     _check_symmetry(system, state, args)
     if isinstance(system, System):

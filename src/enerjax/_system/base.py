@@ -40,7 +40,13 @@ from .._types import (
 
 
 def inexact(x: Any) -> Array:
-    x = jnp.asarray(x)
+    try:
+        x = jnp.asarray(x)
+    except (TypeError, ValueError, DeprecationWarning):
+        raise TypeError(
+            "Coordinates, velocities and inertia must be arrays or lists of numbers, got "
+            f"{x!r}."
+        ) from None
     return x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(float)
 
 

@@ -104,6 +104,11 @@ class System(AbstractSystem):
                 "give `kinematics`."
             )
         if not (callable(kinetic) or isinstance(kinetic, BlockDiagonal)):
+            if kinetic is None or isinstance(kinetic, str) or jnp.iscomplexobj(kinetic):
+                raise TypeError(
+                    "`kinetic` must be a function of (v, args) or the real inertia matrix, "
+                    f"got {kinetic!r}."
+                )
             kinetic = in_blocks(inexact(kinetic))
         self.kinetic = kinetic
         self.potential = potential
