@@ -122,15 +122,16 @@ def independent_rows(scaled: np.ndarray, first: Sequence[int] = ()) -> list[int]
     """
     rank = int(np.sum(np.linalg.svd(scaled, compute_uv=False) > _RANK))
     rows = [*first, *(k for k in range(len(scaled)) if k not in set(first))]
-    basis = np.zeros((0, scaled.shape[1]))
+    basis, count = np.zeros_like(scaled), 0
     own = np.zeros(len(scaled))  # the length of what is not in the rows before
     for k in rows:
-        rest = scaled[k]
+        rest, before = scaled[k], basis[:count]
         for _ in range(2):  # once more for round-off
-            rest = rest - (basis @ rest) @ basis
+            rest = rest - (before @ rest) @ before
         own[k] = np.linalg.norm(rest)
         if own[k] > _RANK:
-            basis = np.vstack([basis, rest / own[k]])
+            basis[count] = rest / own[k]
+            count += 1
     return sorted(np.argsort(-own, kind="stable")[:rank].tolist())
 
 

@@ -146,7 +146,8 @@ class Scene:
         `mobility`.
 
         Rows are named by their joint, `"hinge[0]"`; those within bodies by their number.
-        They count as redundant in the order of the parts, those within bodies never.
+        Those are redundant that follow from rows before them; first come those within
+        bodies.
         """
         state = State(self.q, self.v) if state is None else state
         args = self.args if args is None else args
@@ -200,7 +201,8 @@ class Scene:
         if joint not in self._rows:
             joints = [name for name in self._rows if name in self._ends]
             raise ValueError(f"There is no joint '{joint}'; there are {joints}.")
-        ys = sol.ys if isinstance(sol, Solution) else sol.state
+        at_rest = isinstance(sol, ConsistentStart | Equilibrium)
+        ys = sol.state if at_rest else sol.ys
         args, ends = self.args if args is None else args, self._ends[joint]
         of_state = lambda q, x: reaction(self._layout, q, x, joint, ends, args)
         return each(of_state, ys.q, self.multipliers(sol, joint))
