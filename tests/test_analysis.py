@@ -108,6 +108,12 @@ def test_a_pendulum_on_its_head_is_unstable():
     np.testing.assert_allclose(growth, [np.sqrt(9.81), -np.sqrt(9.81)], rtol=1e-12)
 
 
+def test_a_pose_that_is_no_equilibrium_has_no_modes():
+    system, start, args = problem("pendulum")  # horizontal: its weight is not carried
+    with pytest.raises(ValueError, match="out of balance: -9.81 along coordinate 1"):
+        ej.modes(system, start, args)
+
+
 def _parallelogram(offset=0.0):
     """Four bars and a fifth that repeats the others where it is parallel."""
 
@@ -143,6 +149,14 @@ def test_mobility_of_an_over_constrained_loop():
     assert 3 in found.inconsistent
     with pytest.raises(ValueError, match="2 names for 4 rows"):
         ej.mobility(system, pose, names=["a", "b"])
+
+
+def test_round_off_is_not_inconsistent():
+    """Of rows whose every term almost vanishes, and that repeat each other."""
+    twice = lambda q, args: jnp.array([q[0], 2 * q[0] - 4e-16])
+    system = ej.System(np.eye(2), lambda q, args: 0.0 * q[0], twice, redundant=True)
+    found = ej.mobility(system, ej.State([5e-18, 1.0], np.zeros(2)))
+    assert (found.redundant, found.inconsistent) == ((1,), ())
 
 
 def test_mobility_in_a_singular_pose():

@@ -131,22 +131,59 @@ def test_derivatives_are_unique():
     assert reverse == pytest.approx(float(least), rel=2e-3)  # truncation, of the scheme
 
 
+def beam_of_parts(angle, **more):
+    """On three parallel cranks, `angle` above the horizontal; `length` of the last."""
+    up = np.array([np.cos(angle), np.sin(angle)])
+    feet = dict(left=np.zeros(2), right=np.array([2.0, 0.0]), middle=np.array([1.0, 0.0]))
+    beam = ej.bodies.PlanarBody.rod("beam", 1.0, feet["left"] + up, feet["right"] + up)
+    cranks = [
+        ej.joints.Distance(
+            name, "ground", "beam", foot, foot - feet["middle"],
+            length=more.get("length", 1.0) if name == "middle" else 1.0,
+        )
+        for name, foot in feet.items()
+    ]  # fmt: skip
+    return ej.Scene([beam, *cranks], gravity=[0.0, -G], redundant=True)
+
+
 def test_a_scene_names_the_rows_that_repeat_others():
     """A third crank of a parallelogram."""
-    up = np.array([np.cos(ANGLE), np.sin(ANGLE)])
-    feet = [np.array([x, 0.0]) for x in (0.0, 2.0, 1.0)]
-    beam = ej.bodies.PlanarBody.rod("beam", 1.0, feet[0] + up, feet[1] + up)
-    cranks = [
-        ej.joints.Distance(name, "ground", "beam", foot, foot - feet[2])
-        for name, foot in zip(("left", "right", "middle"), feet, strict=True)
-    ]
-    scene = ej.Scene([beam, *cranks], gravity=[0.0, -G], redundant=True)
+    scene = beam_of_parts(ANGLE)
     found = scene.mobility()
     assert (found.degrees_of_freedom, found.rank) == (1, 2)
-    assert len(found.redundant) == 1
-    assert found.redundant[0] in ("left", "right", "middle")
+    assert found.redundant == ("middle",)  # the last
+    assert "1 degree of freedom" in str(scene)
     system, start, args = scene.build()
     run = ej.simulate(system, ej.EnergyPreserving(), start, args, h=5e-3, num_steps=60)
     assert np.ptp(run.audit.energy) <= 1e3 * EPS * G  # solver
-    pulls = [float(np.linalg.norm(scene.reaction(run, c.name).force[-1])) for c in cranks]
+    cranks = ("left", "right", "middle")
+    pulls = [float(np.linalg.norm(scene.reaction(run, c).force[-1])) for c in cranks]
     assert min(pulls) > 0.1 * max(pulls)  # of least norm: all carry
+    # What cannot be closed: as many as if nothing were repeated.
+    assert "at least 0 degrees of freedom" in str(beam_of_parts(ANGLE, length=1.02))
+
+
+def test_a_repeated_hinge_is_the_one_that_is_redundant():
+    """Not the rows within the body, which it repeats too."""
+    box = ej.bodies.RigidBody("box", 1.0, [0.3, 0.4, 0.5], [0.0, 0.0, 0.0])
+    hinge = lambda name, height: ej.joints.Revolute(
+        name, "ground", "box", [0.0, 0.0, height], axis=[0.0, 0.0, 1.0]
+    )
+    found = ej.Scene([hinge("top", 1.0), box, hinge("foot", 0.0)], redundant=True)
+    found = found.mobility()
+    assert found.redundant == tuple(f"foot[{k}]" for k in range(5))
+    assert found.degrees_of_freedom == 1
+
+
+def test_modes_of_an_over_constrained_scene():
+    """The beam hangs from three bars, and swings as one point does."""
+    system, start, args = beam_of_parts(-np.pi / 2).build()
+    found = ej.modes(system, start, args)
+    np.testing.assert_allclose(found.frequencies, [np.sqrt(G)], rtol=1e-12)
+    first = lambda g: ej.modes(
+        system, start, args.set(gravity=jnp.stack([0 * g, -g]))
+    ).frequencies[0]
+    slope = jax.grad(first)(G)
+    assert float(slope) == pytest.approx(0.5 / np.sqrt(G), rel=1e-12)
+    with pytest.raises(ValueError, match="depends on its pose"):
+        jax.jit(first)(G)

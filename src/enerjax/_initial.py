@@ -89,7 +89,7 @@ def consistent_start(
     - `args`: handed to the functions of the system.
     - `t`: the time of the start, for `force` and `driven`.
     - `known_q`, `known_v`: numbers of the coordinates and velocities that stay as they are
-      given; the others are solved for.
+      given; the others are solved for. Velocities may be known that follow from others.
 
     **Returns:** a `ConsistentStart`.
 
@@ -98,15 +98,36 @@ def consistent_start(
     `equinox.EquinoxRuntimeError` at run time. The same for constraints that are not
     independent at the start, with their rank.
     """
-    state, args = check_system(system, State(q, v), args, t)
+    return _start(system, State(q, v), args, t, known_q, known_v, firmly=True)
+
+
+def start_near(
+    system: AbstractSystem, state: State, args: Args, t: Real, known_v: Sequence[int]
+) -> State:
+    """As `initial_state`, but known velocities give way where the joints do not admit
+    them."""
+    return _start(system, state, args, t, (), known_v, firmly=False).state
+
+
+def _start(
+    system: AbstractSystem,
+    state: State,
+    args: Args,
+    t: Real,
+    known_q: Sequence[int],
+    known_v: Sequence[int],
+    *,
+    firmly: bool,
+) -> ConsistentStart:
+    state, args = check_system(system, state, args, t)
     known = _numbers("known_q", known_q, state.q), _numbers("known_v", known_v, state.v)
     if known[1] and not isinstance(system, System):
         raise ValueError(
             "`known_v`: only the velocities of a plain `System` can be given in part."
         )
-    start, near, rank = _project(system, state, args, known)
+    start, near, kept, rank = _project(system, state, args, known)
     start = _raise_unless(
-        near,
+        near & kept if firmly else near,
         start,
         "The start is too far from the constraints to be repaired: their linearisation "
         "does not explain the error, so the nearest admissible configuration may not be "
@@ -174,14 +195,15 @@ def _project(
     guess: State,
     args: Args,
     known: tuple[tuple[int, ...], tuple[int, ...]],
-) -> tuple[ConsistentStart, Flag, Count]:
+) -> tuple[ConsistentStart, Flag, Flag, Count]:
+    """The start; whether it is near, and keeps known velocities; the constraints' rank."""
     model = make_model(system, guess, args)
     t = guess.t
     before = model.constraint(guess.q, t)
     q, near = project_position(model, guess, known[0])
     given = model.enter(State(q, guess.v, t))
-    velocity, admitted = project_velocity(model, given, known[1])
-    state, near = State(q, velocity, t), near & admitted
+    velocity, kept = project_velocity(model, given, known[1])
+    state = State(q, velocity, t)
     acceleration, multipliers = model.accelerations(state)
     rates = State(model.lift(q, state.v), acceleration, jax.tree.map(jnp.ones_like, t))
     user_state, user_rates = jax.jvp(model.leave, (state,), (rates,))
@@ -194,4 +216,4 @@ def _project(
         model.joint_rate(q, given.v, t),
         model.joint_rate(q, state.v, t),
     )
-    return start, near, jax.lax.stop_gradient(rank_of_constraints(model, state))
+    return start, near, kept, jax.lax.stop_gradient(rank_of_constraints(model, state))

@@ -1,5 +1,8 @@
 """The nearest positions and velocities that satisfy the constraints."""
 
+from collections.abc import Callable
+from typing import TypeAlias
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,6 +15,8 @@ from ._root import find_root
 from ._system import HamiltonianSystem, State
 from ._types import Coordinates, Count, Flag, Multipliers, Velocities
 
+
+Rows: TypeAlias = Callable[[Velocities], Array]
 
 # Coordinates from which the rank of the constraints is not counted.
 _LARGE = 500
@@ -129,34 +134,35 @@ def _linear(held: _Held, metric: Symmetric) -> Flag:
 def project_velocity(
     model: AbstractModel, state: State, known: tuple[int, ...]
 ) -> tuple[Velocities, Flag]:
-    """The nearest velocities (or momenta) that the joints admit, and whether there are any
-    with the known entries."""
+    """The nearest velocities (or momenta) that the joints admit, and whether the known
+    entries are among them as they were given."""
     q, v, t = state.q, state.v, state.t
     if model.joint(q, t).size == 0:
         return v, jnp.array(True)
-    numbers = jnp.asarray(known, int)
-    compliance = model.mobility(state).diagonal()
+    eps = jnp.finfo(v.dtype).eps
+    unit = model.scales.constraint[: model.joint(q, t).size]
+    rates = lambda x: model.joint_rate(q, x, t)
 
-    def held(x: Velocities) -> Array:
-        return jnp.concatenate([model.joint_rate(q, x, t), (x - v)[numbers]])
-
-    num_joints = model.joint(q, t).size
-    unit = jnp.concatenate(
-        [model.scales.constraint[:num_joints], jnp.sqrt(compliance[numbers])]
-    )
-
-    def correct(v: Velocities, _) -> tuple[Velocities, None]:
+    def correct(v: Velocities, held: Rows, unit: Array, fill: Array | None) -> Velocities:
         mobility = model.mobility(State(q, v))
         rate, transpose = jax.vjp(held, v)
         change = lambda mu: mobility @ transpose(mu / unit)[0]
         remaining = lambda mu: (rate - jax.jvp(held, (v,), (change(mu),))[1]) / unit
-        fill = model.fill(rate.size, v.dtype)
-        return v - change(affine_root(remaining, rate, fill)), None
+        return v - change(affine_root(remaining, rate, fill))
 
+    end, root = v, jnp.sqrt(model.mobility(state).diagonal())
+    if known:
+        # What is known may follow from the joints too: their rows need not be independent.
+        numbers = jnp.asarray(known, int)
+        both = lambda x: jnp.concatenate([rates(x), (x - v)[numbers]])
+        units = jnp.concatenate([unit, root[numbers]])
+        fill = jnp.full_like(units, -(eps**0.5))
+        for _ in range(2):  # the second takes back what the fill has changed
+            end = correct(end, both, units, fill)
     # Exact at once where the energy is a quadratic form of the momenta; else Newton.
     corrections = 8 if isinstance(model.system, HamiltonianSystem) else 1
-    end = jax.lax.scan(correct, v, None, length=corrections)[0]
-    if not known:
-        return end, jnp.array(True)
-    off, speed = largest(held(end) / unit), largest(v / jnp.sqrt(compliance))
-    return end, off <= jnp.finfo(v.dtype).eps ** 0.5 * speed
+    fill = model.fill(unit.size, v.dtype)
+    again = lambda v, _: (correct(v, rates, unit, fill), None)
+    end = jax.lax.scan(again, end, None, length=corrections)[0]
+    changed = largest(((end - v) / root)[jnp.asarray(known, int)])
+    return end, changed <= eps**0.5 * largest(v / root)

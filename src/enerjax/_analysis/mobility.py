@@ -28,7 +28,7 @@ class Mobility(NamedTuple):
     - `degrees_of_freedom`: independent velocities that the constraints admit.
     - `rank`: of the constraints; `num_constraints` if they are independent.
     - `num_constraints`: rows, joints first.
-    - `redundant`: numbers (or names) of rows that follow from the others.
+    - `redundant`: numbers (or names) of rows that follow from those before them.
     - `inconsistent`: rows, redundant or not, that are violated in this pose and that no
       small motion repairs together with the others.
     - `singular_values`: of the constraints scaled to order one, descending. A small one
@@ -71,8 +71,21 @@ def mobility(
 
     **Raises:** `ValueError` for bad input, and for a wrong number of names.
     """
+    return freedoms(system, state, args, t, names, ())
+
+
+def freedoms(
+    system: AbstractSystem,
+    state: State,
+    args: Args,
+    t: Real,
+    names: Sequence[str] | None,
+    first: Sequence[int],
+) -> Mobility:
+    """`mobility`, with rows that stand `first`, before those that may follow from them."""
     state, args = check_system(system, state, args, t)
-    scaled, root, residual = _scaled_constraints(system, state, args)
+    gradients, root, residual = linearised(system, state, args)
+    scaled = unit_rows(gradients)
     num_constraints, num_coordinates = scaled.shape
     if names is None:
         names = [str(k) for k in range(num_constraints)]
@@ -87,39 +100,76 @@ def mobility(
         label = lambda rows: tuple(given[k] for k in sorted(rows))
     left, values, right = np.linalg.svd(scaled)
     rank = int(np.sum(values > _RANK))
-    # Rows that span the others come first in a factorisation with pivoting.
-    *_, order = scipy.linalg.qr(scaled.T, pivoting=True)
+    kept = independent_rows(scaled, first)
     # What no motion can repair: the part of the residual outside of the range.
     stuck = left[:, rank:] @ (left[:, rank:].T @ residual)
     return Mobility(
         num_coordinates - rank,
         rank,
         num_constraints,
-        label(order[rank:]),
+        label(set(range(num_constraints)) - set(kept)),
         label(np.nonzero(np.abs(stuck) > _MET)[0]),
         values,
         scipy.linalg.solve_triangular(root.T, right[rank:].T),
     )
 
 
-def _scaled_constraints(
-    system: AbstractSystem, state: State, args: Args
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`dPhi/dq` in units of the constraints and the inertia, the root of the inertia, and
-    the residual in parts of the sizes of the constraints."""
-    metric, jacobian, residual, size = map(np.asarray, _linearised(system, state, args))
+def independent_rows(scaled: np.ndarray, first: Sequence[int] = ()) -> list[int]:
+    """Numbers of the rows that do not follow from those before them, `first` ahead of all.
+
+    As many as the rank.
+    """
+    rank = int(np.sum(np.linalg.svd(scaled, compute_uv=False) > _RANK))
+    rows = [*first, *(k for k in range(len(scaled)) if k not in set(first))]
+    basis, count = np.zeros_like(scaled), 0
+    own = np.zeros(len(scaled))  # the length of what is not in the rows before
+    for k in rows:
+        rest, before = scaled[k], basis[:count]
+        for _ in range(2):  # once more for round-off
+            rest = rest - (before @ rest) @ before
+        own[k] = np.linalg.norm(rest)
+        if own[k] > _RANK:
+            basis[count] = rest / own[k]
+            count += 1
+    return sorted(np.argsort(-own, kind="stable")[:rank].tolist())
+
+
+def unit_rows(gradients: np.ndarray) -> np.ndarray:
+    """Constraints in units of their own: rows of length one."""
+    lengths = np.linalg.norm(gradients, axis=1, keepdims=True)
+    return gradients / np.where(lengths > 0, lengths, 1.0)
+
+
+class Linearised(NamedTuple):
+    """The constraints and the inertia in one pose.
+
+    - `gradients`: `dPhi/dq` in the metric of the inertia.
+    - `root`: the lower triangular root of that metric.
+    - `residual`: how far each constraint is violated, in parts of its size.
+    """
+
+    gradients: np.ndarray
+    root: np.ndarray
+    residual: np.ndarray
+
+
+def linearised(system: AbstractSystem, state: State, args: Args) -> Linearised:
+    """Of numbers, not of traced values."""
+    metric, jacobian, residual, size = map(np.asarray, _evaluated(system, state, args))
     root = np.linalg.cholesky(metric)
-    scaled = scipy.linalg.solve_triangular(root, jacobian.T, lower=True).T
-    lengths = np.linalg.norm(scaled, axis=1)
-    unit = np.where(lengths > 0, lengths, 1.0)
-    return scaled / unit[:, None], root, residual / np.where(size > 0, size, 1.0)
+    gradients = scipy.linalg.solve_triangular(root, jacobian.T, lower=True).T
+    # The size of the terms of a constraint, or of its change where the whole pose is moved
+    # as far as it is from the origin: terms can vanish, too.
+    extent = np.linalg.norm(root.T @ np.asarray(state.q))
+    size = size + extent * np.linalg.norm(gradients, axis=1)
+    return Linearised(gradients, root, residual / np.where(size > 0, size, 1.0))
 
 
 @eqx.filter_jit
-def _linearised(
+def _evaluated(
     system: AbstractSystem, state: State, args: Args
 ) -> tuple[Array, Array, Array, Array]:
-    """The inertia in the coordinates; the constraints: gradients, residuals, sizes."""
+    """One program: the inertia in the coordinates; `dPhi/dq`, `Phi`, and its terms."""
     model = make_model(system, state, args)
     metric = as_dense(model.metric(model.enter(state)))
     jacobian = jax.jacfwd(model.constraint)(state.q, state.t)

@@ -75,8 +75,7 @@ class AbstractModel(eqx.Module):
     def potential(self, state: State) -> Scalar: ...
 
     @abc.abstractmethod
-    def momentum(self, state: State) -> Velocities:
-        """The momenta conjugate to the velocities."""
+    def momentum(self, state: State) -> Velocities: ...
 
     @abc.abstractmethod
     def gradient(self, state: State, h: Scalar) -> Drive:
@@ -135,10 +134,7 @@ class AbstractModel(eqx.Module):
     def stiffness(
         self, state: State, multipliers: Multipliers
     ) -> tuple[Float[Array, "nq nq"] | Assembled, Symmetric]:
-        """`Hess_q (H + lambda . Phi)` and the inertia, where `L = I`.
-
-        Of many elements the first is assembled and the second in blocks, where it can be.
-        """
+        """`Hess_q (H + lambda . Phi)`, assembled of elements if it can be, and the inertia."""
 
     @abc.abstractmethod
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
@@ -176,10 +172,10 @@ class AbstractModel(eqx.Module):
         return jax.jvp(self.joint, (q, t), (self.lift(q, v), lapse_of(t)))[1]
 
     def symmetry_momenta(self, state: State) -> Float[Array, " ns"]:
-        """The momenta of the symmetries that the user has named."""
-        if self.system.symmetry is None:
-            return jnp.zeros((0,), state.q.dtype)
-        return self.system.symmetry(state.q, self.args) @ self.momentum(state)
+        """Of the symmetries that the user has named."""
+        symmetry = self.system.symmetry
+        none = jnp.zeros((0,), state.q.dtype)
+        return symmetry(state.q, self.args) @ self.momentum(state) if symmetry else none
 
     def split(self, increment: Increment) -> tuple[Increment, Increment]:
         """The multipliers of what does not depend on time, and those of what does."""

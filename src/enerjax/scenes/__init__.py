@@ -1,6 +1,7 @@
 """Bodies, joints, forces and drives that compile to the functions of a `System`."""
 
 from . import bodies as bodies, drives as drives, forces as forces, joints as joints
-from ._motions import Gap as Gap
+from ._gaps import Gap as Gap
+from ._motions import Reaction as Reaction
 from ._parameters import Parameters as Parameters
-from .scene import Reaction as Reaction, Scene as Scene
+from .scene import Scene as Scene

@@ -12,6 +12,8 @@ from jaxtyping import Array
 from .._tracing import is_known
 from .._types import Coordinates
 from ._frames import Frame, GROUND, Numbers
+from ._hinges import Hinge, Hinges
+from ._laws import Alignment
 from ._layout import Layout, Link, numbers_of
 from ._numbers import module_of, number
 from ._parameters import Parameters
@@ -29,7 +31,11 @@ def sort_parts(parts: Sequence[Any]) -> dict[type, list[Any]]:
         AbstractBody, AbstractJoint, AbstractForce, AbstractDrive, Constraint, Potential,
     )  # fmt: skip
     found: dict[type, list[Any]] = {kind: [] for kind in kinds}
-    names = {GROUND}
+    if isinstance(parts, kinds):
+        raise TypeError(
+            f"A scene is made of a list of parts: write `Scene([{parts.name}])`."
+        )
+    names = set()
     for part in parts:
         kind = next((kind for kind in kinds if isinstance(part, kind)), None)
         if kind is None:
@@ -38,6 +44,11 @@ def sort_parts(parts: Sequence[Any]) -> dict[type, list[Any]]:
             )
         if not isinstance(part.name, str):
             raise TypeError(f"A name must be a string, got {part.name!r}.")
+        if part.name == GROUND:
+            raise ValueError(
+                f"The name '{GROUND}' is that of what stands still in every scene: give "
+                f"your {type(part).__name__} another."
+            )
         if part.name in names:
             raise ValueError(f"There are two parts with the name '{part.name}'.")
         names.add(part.name)
@@ -65,12 +76,11 @@ def compile_parts(
     bodies = found[AbstractBody]
     named = tuple((body.name, body.kind) for body in bodies)
     rows = numbers_of(named)
-    joined = {frozenset((joint.a, joint.b)) for joint in found[AbstractJoint]}
-    ends = _StartPose(bodies, rows, joined)
-    resolved = {
-        kind: [(part, *part.resolve(ends(part))) for part in found[kind]]
-        for kind in (AbstractJoint, AbstractForce, AbstractDrive)
-    }
+    ends = _StartPose(bodies, rows)
+    resolved = {}
+    for kind in (AbstractJoint, AbstractForce, AbstractDrive):
+        resolved[kind] = [(part, *part.resolve(ends(part))) for part in found[kind]]
+        ends.hinges = _hinges(ends, resolved[AbstractJoint])
     links = {
         kind: tuple(
             Link(part.name, law, rows[part.a], rows[part.b]) for part, law, _ in parts
@@ -94,6 +104,17 @@ def compile_parts(
         drives=_tables(layout.drive_groups, _by_name(resolved[AbstractDrive])),
     )
     return layout, Parameters(tables, _own(own, gravity, layout, tables), layout)
+
+
+def _hinges(ends: "_StartPose", joints: list[tuple]) -> Hinges:
+    found = []
+    for part, law, numbers in joints:
+        if not isinstance(law, Alignment) or not (law.keeps_axis or law.keeps_directions):
+            continue
+        of_a = ends(part).frames[0].axes
+        axis = numbers["frame_a"][2] @ of_a if law.keeps_axis else None
+        found.append(Hinge(part.name, frozenset((part.a, part.b)), axis))
+    return Hinges(found)
 
 
 def _own(own: dict[str, Any], gravity: Any, layout: Layout, tables: Any) -> dict[str, Any]:
@@ -128,21 +149,21 @@ def _tables(groups: Sequence[Any], numbers: dict[str, Numbers]) -> tuple[Numbers
 class _StartPose:
     """Finds the bodies that a part connects, as they start."""
 
-    def __init__(
-        self,
-        bodies: Sequence[AbstractBody],
-        rows: dict[str, int],
-        joined: set[frozenset[str]],
-    ):
+    def __init__(self, bodies: Sequence[AbstractBody], rows: dict[str, int]):
         kinds = tuple((body.name, body.kind) for body in bodies)
         self._layout = Layout(bodies[0].kind.dimension, kinds, (), (), (), (), False)
-        self._rows, self._joined = rows, joined
+        self._rows, self.hinges = rows, Hinges()
         q = join([body.q for body in bodies])
         frames = _all_frames(self._layout, jnp.asarray(q))
         self._frames = jax.device_get(frames) if is_known(frames) else frames
 
     def __call__(self, part: Any) -> Ends:
         for body in (part.a, part.b):
+            if not isinstance(body, str):
+                raise TypeError(
+                    f"'{part.name}' connects bodies by their names, got a "
+                    f"{type(body).__name__}: write '{getattr(body, 'name', '...')}'."
+                )
             if body not in self._rows:
                 raise ValueError(
                     f"'{part.name}' connects '{body}', but there is no such body. There "
@@ -153,9 +174,8 @@ class _StartPose:
         numbers = self._rows[part.a], self._rows[part.b]
         a, b = (jax.tree.map(lambda x, k=k: x[k], self._frames) for k in numbers)
         turns = [k == 0 or bool(self._layout.turning[k]) for k in numbers]
-        joined = frozenset((part.a, part.b)) in self._joined
         return Ends(
-            f"'{part.name}'", (part.a, part.b), (a, b), (turns[0], turns[1]), joined
+            f"'{part.name}'", (part.a, part.b), (a, b), (turns[0], turns[1]), self.hinges
         )
 
 

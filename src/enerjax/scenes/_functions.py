@@ -14,6 +14,7 @@ from .._system import System
 from .._types import Coordinates, Multipliers, Scalar, Velocities
 from ._laws import AbstractPush, Driven
 from ._layout import Layout, Links
+from ._own import ask, vector_of
 from ._parameters import Parameters
 from ._view import rows, View
 
@@ -49,8 +50,8 @@ def potential(layout: Layout, q: Coordinates, args: Parameters) -> Scalar:
     for group, numbers in zip(layout.force_groups, args.tables["forces"], strict=True):
         if not isinstance(group.law, AbstractPush):
             energy = energy + jnp.sum(evaluate(group, view, numbers))
-    for _, function in layout.potentials:
-        energy = energy + function(view, args)
+    for name, function in layout.potentials:
+        energy = energy + ask(name, function, view, args)
     return energy
 
 
@@ -71,7 +72,7 @@ def constraint(layout: Layout, q: Coordinates, args: Parameters) -> Multipliers:
         evaluate(group, view, numbers).reshape(-1)
         for group, numbers in zip(layout.joint_groups, args.tables["joints"], strict=True)
     ]
-    parts += [function(view, args) for _, function in layout.constraints]
+    parts += [vector_of(name, fn, view, args) for name, fn in layout.constraints]
     parts += [
         jax.vmap(group.kind.internal)(rows(q, group.q)).reshape(-1)
         for group in layout.body_groups
@@ -104,7 +105,7 @@ def _now(
     assert isinstance(group.law, AbstractPush | Driven)
     if group.law.signal is None:
         return numbers
-    value = jnp.asarray(group.law.signal(t, args)).astype(t.dtype)
+    value = jnp.asarray(ask(group.names[0], group.law.signal, t, args)).astype(t.dtype)
     wanted = (args.layout.dimension,) if group.law.measure.is_vector else ()
     if value.shape != wanted:
         raise ValueError(

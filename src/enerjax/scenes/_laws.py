@@ -34,6 +34,16 @@ class Alignment(AbstractLaw):
     def has_frames(self) -> bool:
         return bool(self.square or self.along)
 
+    @property
+    def keeps_directions(self) -> bool:
+        """Whether the second frame does not turn against the first."""
+        return len(self.square) == 3
+
+    @property
+    def keeps_axis(self) -> bool:
+        """Whether the last axis of the first frame stays one of the second."""
+        return self.square == ((2, 0), (2, 1))
+
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Multipliers:
         apart = offset(a, b, numbers)
         if not self.has_frames:
@@ -122,6 +132,20 @@ class Driven(AbstractLaw):
 
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Multipliers:
         return self.measure.away(a, b, numbers, numbers["value"])
+
+
+@dataclass(frozen=True)
+class Missed(AbstractLaw):
+    """How far a drive is from `numbers["value"]`."""
+
+    measure: AbstractMeasure
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return self.measure.reads
+
+    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Multipliers:
+        return self.measure.missed(a, b, numbers, numbers["value"])
 
 
 class AbstractPush(AbstractLaw):

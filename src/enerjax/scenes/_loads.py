@@ -15,7 +15,8 @@ from ._measures import (
     Separation,
     turn_of,
 )
-from ._numbers import check_signal, number
+from ._numbers import number
+from ._own import check_function
 from ._start import Ends
 
 
@@ -36,15 +37,15 @@ class Damper(AbstractForce):
     point_b: Vector | None = None
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
-        points = ends.origins(self.point_a, self.point_b)
+        points, _ = ends.apart(self.point_a, self.point_b)
         return Viscous(Separation()), points | _damping(ends, self.damping)
 
 
 class TorsionDamper(AbstractForce):
     """A viscous damper of the angle between two bodies: a torque `-damping * rate`.
 
-    In space about `axis`, told in the first body, of two bodies that a revolute or
-    cylindrical joint connects about this axis. Full turns do not matter.
+    In space about `axis`, told in the first body, which revolute or cylindrical joints must
+    keep common to both bodies. Full turns do not matter.
     """
 
     name: str
@@ -77,10 +78,10 @@ class Actuator(AbstractForce):
     point_b: Vector | None = None
 
     def __check_init__(self):
-        check_signal(self.name, "force", self.force)
+        check_function(self.name, "force", self.force, "t", "args")
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
-        points = ends.origins(self.point_a, self.point_b)
+        points, _ = ends.apart(self.point_a, self.point_b)
         return Acting(Separation(), self.force), points
 
 
@@ -98,7 +99,7 @@ class TorsionActuator(AbstractForce):
     axis: Vector | None = None
 
     def __check_init__(self):
-        check_signal(self.name, "torque", self.torque)
+        check_function(self.name, "torque", self.torque, "t", "args")
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         measure, numbers = turn_of(ends, self.axis)
@@ -122,7 +123,7 @@ class Load(AbstractForce):
         self.force, self.point = force, point
 
     def __check_init__(self):
-        check_signal(self.name, "force", self.force)
+        check_function(self.name, "force", self.force, "t", "args")
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         point = ends.origins(None, self.point)["point_b"]
@@ -143,7 +144,7 @@ class Follower(AbstractForce):
         self.force, self.point = force, point
 
     def __check_init__(self):
-        check_signal(self.name, "force", self.force)
+        check_function(self.name, "force", self.force, "t", "args")
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         ends.only_bodies_that_turn()

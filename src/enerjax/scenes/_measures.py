@@ -39,6 +39,10 @@ class AbstractMeasure(AbstractLaw):
         """Rows that vanish where the measure has this value, of slope one there."""
         return (self(a, b, numbers) - value).reshape(-1)
 
+    def missed(self, a: Frame, b: Frame, numbers: Numbers, value: Any) -> Multipliers:
+        """How far the measure is from this value, for reports."""
+        return self.away(a, b, numbers, value)
+
 
 @dataclass(frozen=True)
 class Separation(AbstractMeasure):
@@ -90,8 +94,20 @@ class Turn(AbstractMeasure):
 
     def away(self, a: Frame, b: Frame, numbers: Numbers, value: Any) -> Multipliers:
         # The sine of the difference: smooth over any number of turns.
+        return self._turned_back(a, b, numbers, value)[1].reshape(-1)
+
+    def missed(self, a: Frame, b: Frame, numbers: Numbers, value: Any) -> Multipliers:
+        # The sine vanishes half a turn away too.
+        along, across = self._turned_back(a, b, numbers, value)
+        return jnp.arctan2(across, along).reshape(-1)
+
+    def _turned_back(
+        self, a: Frame, b: Frame, numbers: Numbers, value: Any
+    ) -> tuple[Scalar, Scalar]:
+        """Cosine and sine of the angle less a value."""
         along, across = self._components(a, b, numbers)
-        return (across * jnp.cos(value) - along * jnp.sin(value)).reshape(-1)
+        c, s = jnp.cos(value), jnp.sin(value)
+        return along * c + across * s, across * c - along * s
 
     def _components(self, a: Frame, b: Frame, numbers: Numbers) -> tuple[Scalar, Scalar]:
         x, y = (a.direction(numbers["frame_a"][k]) for k in (0, 1))
@@ -105,4 +121,4 @@ def turn_of(ends: Ends, axis: Vector | None) -> tuple[AbstractMeasure, Numbers]:
         ends.refuse_axes(axis)
         ends.only_bodies_that_turn()
         return PlanarTurn(), {}
-    return Turn(), ends.axes(axis)
+    return Turn(), ends.about(axis)

@@ -37,20 +37,30 @@ def number(
     return array
 
 
-def check_signal(part: str, role: str, value: Any) -> None:
-    """Raises for what is no function of time."""
-    if not callable(value):
-        raise TypeError(
-            f"`{role}` of '{part}' must be a function of (t, args), got "
-            f"{type(value).__name__}."
-        )
-
-
 def positive(part: str, role: str, value: Any) -> Any:
     array = number(part, role, value, ())
     if is_known(array) and not array > 0:
         raise ValueError(f"{role} of {part} must be positive, got {value}.")
     return array
+
+
+def joined(*parts: Any) -> Any:
+    """All entries one after the other."""
+    return module_of(parts).concatenate([x.reshape(-1) for x in parts])
+
+
+def velocities(
+    part: str, *told: tuple[Any, tuple[int, ...]]
+) -> tuple[Any, tuple[bool, ...]]:
+    """All entries of a velocity and an angular velocity, told with their shapes, zeros
+    where they are `None`; and which are given."""
+    entries, given = [], []
+    roles = ("`velocity`", "`angular_velocity`")[: len(told)]
+    for role, (value, shape) in zip(roles, told, strict=True):
+        some = np.zeros(shape) if value is None else value
+        entries.append(number(part, role, some, shape))
+        given += [value is not None] * entries[-1].size
+    return joined(*entries), tuple(given)
 
 
 def direction(part: str, role: str, value: Any, dimension: int) -> Any:

@@ -61,6 +61,8 @@ def _like(old: Mapping[str, Any], key: str, value: Any) -> Any:
     if not eqx.is_array(old[key]):
         return value
     new = jnp.asarray(value, old[key].dtype)
+    if key == "inertia" and old[key].ndim == 2 and new.shape == (3,):
+        new = jnp.diag(new)  # principal moments, as bodies take them
     if new.shape != old[key].shape:
         raise ValueError(f"`{key}` has shape {old[key].shape}, got {new.shape}.")
     return new

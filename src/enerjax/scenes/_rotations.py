@@ -5,17 +5,20 @@ from typing import Any
 import numpy as np
 
 from .._tracing import is_known
-from ._numbers import module_of, number
+from ._frames import Numbers
+from ._numbers import module_of, number, positive
 
 
-def symmetric_inertia(name: str, inertia: Any, may_be_flat: bool) -> Any:
-    """The matrix `(3, 3)` of principal moments or of a matrix, if a body can have it."""
+def mass_and_inertia(name: str, mass: Any, inertia: Any, *, may_be_flat: bool) -> Numbers:
+    """The inertia as a matrix `(3, 3)`, of principal moments or a matrix that a body can
+    have."""
+    mass = positive(f"'{name}'", "`mass`", mass)
     matrix = number(f"'{name}'", "`inertia`", inertia, (3,), (3, 3))
     if matrix.ndim == 1:
         matrix = module_of(matrix).diag(matrix)
     if is_known(matrix):
         _check_inertia(name, matrix, may_be_flat)
-    return matrix
+    return dict(mass=mass, inertia=matrix)
 
 
 def _check_inertia(name: str, matrix: np.ndarray, may_be_flat: bool) -> None:

@@ -2,11 +2,13 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
-from .._types import Coordinates
-from ._functions import constraint, drives_at, evaluate, redundancy
+from .._types import Coordinates, Real
+from ._functions import constraint, driven, drives_at, evaluate, redundancy
 from ._layout import Layout
+from ._own import vector_of
 from ._parameters import Parameters
 from ._view import View
 
@@ -25,7 +27,8 @@ def rows_of(layout: Layout, q: Coordinates, args: Parameters) -> dict[str, slice
         view = View(layout, q)
         groups = zip(layout.joint_groups, args.tables["joints"], strict=True)
         found = [evaluate(group, view, numbers) for group, numbers in groups]
-        return found + [function(view, args)[None] for _, function in layout.constraints]
+        own = [vector_of(name, fn, view, args) for name, fn in layout.constraints]
+        return found + [rows[None] for rows in own]
 
     def of_drives(q: Coordinates) -> list[Array]:
         view = View(layout, q)
@@ -61,3 +64,24 @@ def row_names(
         for k in range(place.start, place.stop):
             names[k] = f"{name}[{k - place.start}]" if several else name
     return names
+
+
+def first_dependent(
+    layout: Layout, q: Coordinates, t: Real, args: Parameters, places: dict[str, slice]
+) -> str | None:
+    """The first joint with a row that those before it determine already."""
+    start = jnp.asarray(t, q.dtype)
+    held = []
+    if layout.has_constraints:
+        held += [*jax.jacfwd(lambda x: constraint(layout, x, args))(q)]
+    if layout.drives:
+        held += [*jax.jacfwd(lambda x: driven(layout, x, start, args))(q)]
+    joined = {k for place in places.values() for k in range(place.start, place.stop)}
+    # What bodies have of their own stands before.
+    taken = [row for k, row in enumerate(held) if k not in joined]
+    taken += [*jax.jacfwd(lambda x: redundancy(layout, x, args))(q)]
+    for name, place in places.items():
+        taken += held[place]
+        if np.linalg.matrix_rank(np.array(taken)) < len(taken):
+            return name
+    return None

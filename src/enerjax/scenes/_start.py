@@ -2,8 +2,11 @@
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from .._tracing import is_known
 from ._frames import Frame, Numbers
+from ._hinges import Hinges
 from ._numbers import basis, direction, module_of, number
 
 
@@ -13,14 +16,14 @@ class Ends(NamedTuple):
     - `part`, `bodies`: names, for messages.
     - `frames`: with all fields that the plane or space has.
     - `turns`: whether each has an orientation; the ground counts as one that has.
-    - `joined`: whether a joint connects them.
+    - `hinges`: the joints of the scene that keep an axis; none are known to joints.
     """
 
     part: str
     bodies: tuple[str, str]
     frames: tuple[Frame, Frame]
     turns: tuple[bool, bool]
-    joined: bool = False
+    hinges: Hinges = Hinges()
 
     @property
     def dimension(self) -> int:
@@ -50,6 +53,26 @@ class Ends(NamedTuple):
             return dict(frame_a=of_a, frame_b=of_a @ a.axes @ b.axes.T)
         return dict(frame_a=of_a, frame_b=basis(self._axis("`axis_b`", axis_b)))
 
+    def two_axes(self, axis_a: Any, axis_b: Any) -> Numbers:
+        """As `axes`, where both must be given."""
+        self._axis("`axis_b`", axis_b)
+        return self.axes(axis_a, axis_b)
+
+    def about(self, axis: Any) -> Numbers:
+        """As `axes`, of one that joints keep common to both bodies."""
+        numbers = self.axes(axis)
+        along = numbers["frame_a"][2] @ self.frames[0].axes
+        (a, b), others = self.bodies, self.hinges.between(*self.bodies)
+        if self.hinges.share(a, b, along):
+            return numbers
+        told = lambda axis: np.round(axis, 4).tolist()
+        raise ValueError(
+            f"{self.part} has an angle only with a joint about its axis, a `Revolute` or "
+            f"`Cylindrical`, and none connects '{a}' and '{b}'"
+            + "".join(f": '{x.name}' turns about {told(x.axis)}" for x in others)
+            + (f", {self.part} about {told(along)}, in space." if others else ".")
+        )
+
     def first_axes(self, axis_a: Any) -> Numbers:
         """Axes in the first body alone, as rows."""
         self._must_turn(0)
@@ -60,12 +83,19 @@ class Ends(NamedTuple):
             raise ValueError(f"{self.part} needs {role}, a vector of {self.dimension}.")
         return direction(self.part, role, axis, self.dimension)
 
-    def length(self, numbers: Numbers) -> Any:
-        """The distance of two points at the start."""
+    def apart(self, point_a: Any, point_b: Any) -> tuple[Numbers, Any]:
+        """As `origins`, of points that do not meet, and their distance at the start."""
+        numbers = self.origins(point_a, point_b)
         ends = zip(self.frames, ("point_a", "point_b"), strict=True)
         a, b = (frame.origin + numbers[key] @ frame.axes for frame, key in ends)
         xp = module_of(a, b)
-        return xp.sqrt(xp.sum((b - a) ** 2))
+        length = xp.sqrt(xp.sum((b - a) ** 2))
+        if is_known(length) and length <= 1e-12 * (abs(a).max() + abs(b).max()):
+            raise ValueError(
+                f"{self.part} acts along the line of two points, and at the start those of "
+                f"'{self.bodies[0]}' and '{self.bodies[1]}' meet, in {a.tolist()}."
+            )
+        return numbers, length
 
     def turn(self) -> Any:
         """The difference of the angles at the start."""
@@ -85,11 +115,6 @@ class Ends(NamedTuple):
                 f"{self.part} needs the orientation of '{self.bodies[k]}', and a point "
                 "mass has none."
             )
-
-    def only_joined(self, what: str) -> None:
-        if not self.joined:
-            a, b = self.bodies
-            raise ValueError(f"{self.part} {what}, and none connects '{a}' and '{b}'.")
 
     def only_in_space(self, what: str) -> None:
         if self.dimension == 2:

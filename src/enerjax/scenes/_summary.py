@@ -8,17 +8,25 @@ def summary(
     kinds: dict[str, str],
     ends: dict[str, tuple[str, str]],
     rows: dict[str, slice],
+    may_repeat: bool,
+    freedoms: int | None,
 ) -> str:
-    """Bodies, joints, forces and drives with what they are and what they count for."""
+    """Bodies, joints, forces and drives with what they are and what they count for.
+
+    `freedoms` are those that were counted, where joints may repeat each other.
+    """
     bodies, joined = dict(layout.bodies), {x for pair in ends.values() for x in pair}
-    internal = sum(kind.num_internal for kind in bodies.values())
     held = sum(place.stop - place.start for place in rows.values())
+    least = ""
+    if freedoms is None:
+        internal = sum(kind.num_internal for kind in bodies.values())
+        independent = layout.num_velocities - internal - held
+        freedoms, least = max(independent, 0), "at least " if may_repeat else ""
     world = "the plane" if layout.dimension == 2 else "space"
-    freedom = layout.num_velocities - internal - held
     holders = "joints and drives" if layout.drives else "joints"
     lines = [
         f"A scene in {world}: {layout.num_coordinates} coordinates, {held} constraints of "
-        f"{holders}, {freedom} degree{'' if freedom == 1 else 's'} of freedom."
+        f"{holders}, {least}{freedoms} degree{'' if freedoms == 1 else 's'} of freedom."
     ]
     width = max(len(name) for name in kinds)
     line = lambda name, text: f"  {name:{width}}  {kinds[name]:14}  {text}".rstrip()

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._tracing import is_known
 from .._types import Coordinates, Scalar, Vector
 from ._frames import Frame, Point
 from ._layout import Layout
@@ -72,6 +73,11 @@ class View:
         return Frame(self.origins[k], self.axes[k], self.angles[k])
 
     def _number(self, body: str) -> int:
+        if not isinstance(body, str):
+            raise TypeError(
+                f"Bodies are told by their names, got a {type(body).__name__}: write "
+                f"'{getattr(body, 'name', '...')}'."
+            )
         try:
             return self.layout.numbers_of_bodies[body]
         except KeyError:
@@ -85,14 +91,37 @@ class View:
         if point is None:
             return self.origins[k]
         axes = self.axes[k] if self.layout.turning[k] else None
-        return Frame(self.origins[k], axes).point(jnp.asarray(point, self.q.dtype))
+        return Frame(self.origins[k], axes).point(self._vector(body, "point", point))
 
     def direction(self, body: str, axis: Vector) -> Point:
         """A direction of a body in space."""
-        return Frame(axes=self.axes[self._number(body)]).direction(
-            jnp.asarray(axis, self.q.dtype)
-        )
+        axes = self.axes[self._number(body)]
+        return Frame(axes=axes).direction(self._vector(body, "axis", axis))
+
+    def _vector(self, body: str, role: str, value: Vector) -> Point:
+        """A point or an axis in the frame of a body, which must be one that turns."""
+        vector, dimension = jnp.asarray(value, self.q.dtype), self.layout.dimension
+        if vector.shape != (dimension,):
+            raise ValueError(
+                f"A `{role}` of '{body}' must be of {dimension} entries, got shape "
+                f"{vector.shape}."
+            )
+        k = self._number(body)
+        at_centre = is_known(value) and not np.any(np.asarray(value))
+        if k > 0 and not self.layout.turning[k] and not at_centre:
+            raise ValueError(
+                f"'{body}' is a point mass, without an orientation: it has no `{role}` of "
+                "its own."
+            )
+        return vector
 
     def angle(self, body: str) -> Scalar:
         """The angle of a body in the plane."""
-        return self.angles[self._number(body)]
+        k = self._number(body)
+        if self.layout.dimension == 3:
+            raise ValueError(
+                f"'{body}' is in space, where a body has no angle: ask for a `direction`."
+            )
+        if k > 0 and not self.layout.turning[k]:
+            raise ValueError(f"'{body}' is a point mass: it has no angle.")
+        return self.angles[k]

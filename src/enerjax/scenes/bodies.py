@@ -1,20 +1,20 @@
 """Bodies: what has mass.
 
 The origin of a body frame is the mass centre. Poses and velocities are told in space, at
-the start; points, axes and inertias in the frame of the body.
+the start; points, axes and inertias in the frame of the body. Velocities that are left out
+follow from those that are given, by the joints.
 """
 
 import abc
 from typing import Any
 
 import equinox as eqx
-import numpy as np
 
 from .._types import Real, Vector
 from ._frames import Numbers
 from ._kinds import AbstractKind, DirectorBodies, PlanarBodies, Points, QuaternionBodies
-from ._numbers import module_of, number, positive
-from ._rotations import quaternion_of, rotation_matrix, symmetric_inertia
+from ._numbers import joined, module_of, number, positive, velocities
+from ._rotations import mass_and_inertia, quaternion_of, rotation_matrix
 
 
 class AbstractBody(eqx.Module):
@@ -22,12 +22,14 @@ class AbstractBody(eqx.Module):
 
     - `numbers`: mass and inertia, as they stand in `args["bodies"][name]`.
     - `q`, `v`: its coordinates and velocities at the start.
+    - `given`: which velocities are told; the others are zeros.
     """
 
     name: eqx.AbstractVar[str]
     numbers: eqx.AbstractVar[Numbers]
     q: eqx.AbstractVar[Any]
     v: eqx.AbstractVar[Any]
+    given: eqx.AbstractVar[tuple[bool, ...]]
 
     @property
     @abc.abstractmethod
@@ -43,7 +45,7 @@ class PointMass(AbstractBody):
     - `name`: a string, unique in the scene.
     - `mass`: positive.
     - `position`, `velocity`: at the start, of two or three entries (length, length per
-      time); at rest where no velocity is given.
+      time).
 
     Its coordinates are the position. It has no orientation: joints that hold one refuse it.
     """
@@ -52,6 +54,7 @@ class PointMass(AbstractBody):
     numbers: Numbers
     q: Any
     v: Any
+    given: tuple[bool, ...]
 
     def __init__(
         self, name: str, mass: Real, position: Vector, velocity: Vector | None = None
@@ -59,7 +62,7 @@ class PointMass(AbstractBody):
         self.name = name
         self.numbers = dict(mass=positive(f"'{name}'", "`mass`", mass))
         self.q = number(f"'{name}'", "`position`", position, (2,), (3,))
-        self.v = _given(name, "`velocity`", velocity, self.q.shape)
+        self.v, self.given = velocities(f"'{name}'", (velocity, self.q.shape))
 
     @property
     def kind(self) -> AbstractKind:
@@ -84,6 +87,7 @@ class PlanarBody(AbstractBody):
     numbers: Numbers
     q: Any
     v: Any
+    given: tuple[bool, ...]
 
     def __init__(
         self,
@@ -94,7 +98,7 @@ class PlanarBody(AbstractBody):
         angle: Real = 0.0,
         *,
         velocity: Vector | None = None,
-        angular_velocity: Real = 0.0,
+        angular_velocity: Real | None = None,
     ):
         part = f"'{name}'"
         self.name = name
@@ -103,9 +107,10 @@ class PlanarBody(AbstractBody):
             inertia=positive(part, "`inertia`", inertia),
         )
         place = number(part, "`position`", position, (2,))
-        self.q = _join(place, number(part, "`angle`", angle, ()))
-        speed = _given(name, "`velocity`", velocity, (2,))
-        self.v = _join(speed, number(part, "`angular_velocity`", angular_velocity, ()))
+        self.q = joined(place, number(part, "`angle`", angle, ()))
+        self.v, self.given = velocities(
+            f"'{name}'", (velocity, (2,)), (angular_velocity, ())
+        )
 
     @property
     def kind(self) -> AbstractKind:
@@ -118,7 +123,7 @@ class PlanarBody(AbstractBody):
         start: Vector,
         end: Vector,
         velocity: Vector | None = None,
-        angular_velocity: Real = 0.0,
+        angular_velocity: Real | None = None,
     ) -> "PlanarBody":
         """A uniform slender rod between two points of the plane.
 
@@ -168,6 +173,7 @@ class RigidBody(AbstractBody):
     numbers: Numbers
     q: Any
     v: Any
+    given: tuple[bool, ...]
 
     def __init__(
         self,
@@ -181,13 +187,13 @@ class RigidBody(AbstractBody):
         angular_velocity: Vector | None = None,
     ):
         self.name = name
-        self.numbers = _mass_and_inertia(name, mass, inertia, may_be_flat=False)
+        self.numbers = mass_and_inertia(name, mass, inertia, may_be_flat=False)
         place = number(f"'{name}'", "`position`", position, (3,))
         axes = rotation_matrix(name, rotation).T
-        spin = _given(name, "`angular_velocity`", angular_velocity, (3,))
-        self.q = _join(place, axes)
-        rates = module_of(spin, axes).cross(spin[None], axes)
-        self.v = _join(_given(name, "`velocity`", velocity, (3,)), rates)
+        self.q = joined(place, axes)
+        v, given = velocities(f"'{name}'", (velocity, (3,)), (angular_velocity, (3,)))
+        self.v = joined(v[:3], module_of(v, axes).cross(v[None, 3:], axes))
+        self.given = (*given[:3], *given[3:] * 3)
 
     @property
     def kind(self) -> AbstractKind:
@@ -207,6 +213,7 @@ class QuaternionBody(AbstractBody):
     numbers: Numbers
     q: Any
     v: Any
+    given: tuple[bool, ...]
 
     def __init__(
         self,
@@ -220,26 +227,13 @@ class QuaternionBody(AbstractBody):
         angular_velocity: Vector | None = None,
     ):
         self.name = name
-        self.numbers = _mass_and_inertia(name, mass, inertia, may_be_flat=True)
+        self.numbers = mass_and_inertia(name, mass, inertia, may_be_flat=True)
         place = number(f"'{name}'", "`position`", position, (3,))
         matrix = rotation_matrix(name, rotation)
-        spin = _given(name, "`angular_velocity`", angular_velocity, (3,))
-        self.q = _join(place, quaternion_of(matrix))
-        self.v = _join(_given(name, "`velocity`", velocity, (3,)), spin @ matrix)
+        self.q = joined(place, quaternion_of(matrix))
+        v, self.given = velocities(f"'{name}'", (velocity, (3,)), (angular_velocity, (3,)))
+        self.v = joined(v[:3], v[3:] @ matrix)
 
     @property
     def kind(self) -> AbstractKind:
         return QuaternionBodies()
-
-
-def _given(name: str, role: str, value: Any, shape: tuple[int, ...]) -> Any:
-    return np.zeros(shape) if value is None else number(f"'{name}'", role, value, shape)
-
-
-def _join(*parts: Any) -> Any:
-    return module_of(parts).concatenate([x.reshape(-1) for x in parts])
-
-
-def _mass_and_inertia(name: str, mass: Any, inertia: Any, *, may_be_flat: bool) -> Numbers:
-    mass = positive(f"'{name}'", "`mass`", mass)
-    return dict(mass=mass, inertia=symmetric_inertia(name, inertia, may_be_flat))

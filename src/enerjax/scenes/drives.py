@@ -16,7 +16,7 @@ from .._types import Args, Scalar, Vector
 from ._frames import GROUND, Numbers
 from ._laws import Driven
 from ._measures import AbstractLaw, Place, Separation, Slide, turn_of
-from ._numbers import check_signal
+from ._own import check_function
 from ._start import Ends
 
 
@@ -29,7 +29,7 @@ class AbstractDrive(eqx.Module):
     motion: eqx.AbstractVar[Callable[[Scalar, Args], Array]]
 
     def __check_init__(self):
-        check_signal(self.name, "motion", self.motion)
+        check_function(self.name, "motion", self.motion, "t", "args")
 
     @abc.abstractmethod
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
@@ -40,8 +40,8 @@ class Angle(AbstractDrive):
     """Prescribes the angle of the second body against the first: a motor that turns.
 
     In the plane the difference of their angles. In space the turn from the start pose
-    about `axis`, told in the first body, of two bodies that a revolute or cylindrical
-    joint connects about this axis; over any number of turns.
+    about `axis`, told in the first body, which revolute or cylindrical joints must keep
+    common to both bodies; over any number of turns.
     """
 
     name: str
@@ -51,8 +51,6 @@ class Angle(AbstractDrive):
     axis: Vector | None = None
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
-        if ends.dimension == 3:
-            ends.only_joined("has an angle only with a joint about its axis: a `Revolute`")
         measure, numbers = turn_of(ends, self.axis)
         return Driven(measure, self.motion), numbers
 
@@ -90,7 +88,7 @@ class Distance(AbstractDrive):
     point_b: Vector | None = None
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
-        numbers = ends.origins(self.point_a, self.point_b)
+        numbers, _ = ends.apart(self.point_a, self.point_b)
         return Driven(Separation(), self.motion), numbers
 
 

@@ -25,6 +25,7 @@ from ._loads import (
 )
 from ._measures import AbstractLaw
 from ._numbers import number
+from ._own import check_function
 from ._start import Ends
 
 
@@ -44,11 +45,11 @@ class Spring(AbstractForce):
     point_b: Vector | None = None
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
-        numbers = ends.origins(self.point_a, self.point_b)
-        length = ends.length(numbers) if self.length is None else self.length
+        numbers, start = ends.apart(self.point_a, self.point_b)
+        length = start if self.length is None else self.length
         return SpringEnergy(), numbers | dict(
             stiffness=number(ends.part, "`stiffness`", self.stiffness, ()),
-            length=number(ends.part, "`length`", length, ()),
+            length=number(ends.part, "`length`", length, (), least=0.0),
         )
 
 
@@ -58,8 +59,8 @@ class TorsionSpring(AbstractForce):
     In the plane `turn` is the difference of the angles, over any number of turns, and an
     `angle` that is not given is that of the start. In space `turn` is counted from the
     start about `axis`, told in the first body, and `angle` is zero if it is not given;
-    bodies that a revolute joint connects about this axis. The energy jumps at half a turn
-    there: keep away from it.
+    revolute or cylindrical joints must keep this axis common to both bodies. The energy
+    jumps at half a turn there: keep away from it.
     """
 
     name: str
@@ -73,10 +74,11 @@ class TorsionSpring(AbstractForce):
         numbers = dict(stiffness=number(ends.part, "`stiffness`", self.stiffness, ()))
         if ends.dimension == 2:
             ends.refuse_axes(self.axis)
+            ends.only_bodies_that_turn()
             law, start = PlanarTorsion(), ends.turn()
         else:
             law, start = Torsion(), 0.0
-            numbers |= ends.axes(self.axis)
+            numbers |= ends.about(self.axis)
         angle = start if self.angle is None else self.angle
         return law, numbers | dict(angle=number(ends.part, "`angle`", angle, ()))
 
@@ -120,6 +122,7 @@ class ConstantTorque(AbstractForce):
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         ends.only_in_plane("A constant torque has a potential only in the plane")
+        ends.only_bodies_that_turn()
         torque = number(ends.part, "`torque`", self.torque, ())
         return PlanarTwist(), dict(torque=torque)
 
@@ -133,3 +136,6 @@ class Potential(eqx.Module):
 
     name: str
     function: Callable[[Any, Args], Array]
+
+    def __check_init__(self):
+        check_function(self.name, "function", self.function, "view", "args")

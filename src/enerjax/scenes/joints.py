@@ -16,6 +16,8 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._types import Args, Real, Vector
@@ -23,6 +25,7 @@ from ._frames import Numbers
 from ._laws import Alignment, Curve, Length
 from ._measures import AbstractLaw
 from ._numbers import module_of, positive
+from ._own import check_function, vector_of
 from ._start import Ends
 
 
@@ -94,9 +97,8 @@ class Universal(AbstractJoint):
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         ends.only_in_space("A universal joint")
-        axes = ends.axes(self.axis, () if self.axis_b is None else self.axis_b)
         points = ends.points(self.point_a, self.point_b)
-        return Alignment(None, ((2, 2),)), points | axes
+        return Alignment(None, ((2, 2),)), points | ends.two_axes(self.axis, self.axis_b)
 
 
 class Prismatic(AbstractJoint):
@@ -184,7 +186,7 @@ class Distance(AbstractJoint):
     """Holds two points at a distance: a rod without mass. One constraint.
 
     Points that are not given are the origins of the frames, a `length` (positive) that is
-    not given is that of the start.
+    not given is that of the start. The points must not meet.
     """
 
     name: str
@@ -195,8 +197,8 @@ class Distance(AbstractJoint):
     length: Real | None = None
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
-        numbers = ends.origins(self.point_a, self.point_b)
-        length = ends.length(numbers) if self.length is None else self.length
+        numbers, start = ends.apart(self.point_a, self.point_b)
+        length = start if self.length is None else self.length
         return Length(), numbers | dict(length=positive(ends.part, "`length`", length))
 
 
@@ -216,12 +218,17 @@ class OnCurve(AbstractJoint):
     numbers: Numbers = eqx.field(default_factory=dict)
     point_b: Vector | None = None
 
+    def __check_init__(self):
+        check_function(self.name, "curve", self.curve, "x", "numbers")
+
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         own = {
             key: module_of(value).asarray(value) * 1.0
             for key, value in self.numbers.items()
         }
         point = ends.origins(None, self.point_b)["point_b"]
+        x = jnp.zeros((ends.dimension,))
+        jax.eval_shape(lambda x: vector_of(self.name, self.curve, x, own), x)
         return Curve(self.curve), own | dict(point_b=point)
 
 
@@ -234,3 +241,6 @@ class Constraint(eqx.Module):
 
     name: str
     function: Callable[[Any, Args], Array]
+
+    def __check_init__(self):
+        check_function(self.name, "function", self.function, "view", "args")

@@ -1,48 +1,32 @@
 """A scene: bodies, joints, forces and drives, and the system that they make."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._analysis import Mobility, mobility
-from .._initial import ConsistentStart, initial_state
+from .._analysis import Equilibrium, freedoms, Mobility
+from .._initial import ConsistentStart
 from .._solution import Solution
 from .._system import State, System
 from .._tracing import is_known
 from .._types import Coordinates, Real, Vector
+from ._closing import check_poses, closed_start, gaps_of, Told
 from ._compile import compile_parts, join, sort_parts
-from ._frames import Numbers, Point
+from ._frames import Point
 from ._functions import lift, make_system
-from ._laws import Driven
-from ._layout import Links
-from ._motions import first_dependent, Gap, gaps, reaction
+from ._gaps import Gap, Measured
+from ._motions import each, Reaction, reaction
 from ._parameters import Parameters
-from ._rows import members, row_names, rows_of
+from ._rows import row_names, rows_of
 from ._summary import summary
 from ._view import View
 from .bodies import AbstractBody
 from .drives import AbstractDrive
 from .forces import AbstractForce
 from .joints import AbstractJoint
-
-
-# A joint that is further from closed than this part of the scene is a mistake.
-_FAR = 0.05
-
-
-class Reaction(NamedTuple):
-    """What a joint does to its second body, in space, at each saved time.
-
-    - `force`: shape `(times, d)`.
-    - `torque`: about the joint's point on that body, `(times, 3)`, in the plane
-      `(times, 1)`.
-    """
-
-    force: Array
-    torque: Array
 
 
 class Scene:
@@ -77,8 +61,8 @@ class Scene:
 
     **Raises:** `ValueError` or `TypeError` for parts that do not fit together, with their
     names: unknown or repeated names, masses and inertias that no body has, a joint that is
-    far from closed at the start. A joint that is off by a little is closed by `start`;
-    `report` tells by how much.
+    far from closed at the start. A joint that is off by a little, as its bodies measure,
+    is closed by `start`; `report` tells by how much.
     """
 
     system: System
@@ -109,52 +93,74 @@ class Scene:
         if self.system.force is not None:  # a function of the user's own may not fit
             t = jnp.zeros((), self.q.dtype)
             jax.eval_shape(self.system.force, self.q, self.v, t, self.args)
-        self._check_gaps()
+        told = [flag for body in bodies for flag in body.given]
+        self._given = tuple(k for k, flag in enumerate(told) if flag)
+        if self._rows and is_known((self.q, self.v, self.args)):
+            check_poses(self._gaps(None, 0.0, None), self._ends, 0.0)
 
     def build(self) -> tuple[System, State, Parameters]:
         """`(system, start, args)`, as all functions take them."""
         return self.system, self.start(), self.args
 
-    def start(self, args: Parameters | None = None) -> State:
+    def start(self, args: Parameters | None = None, *, t: Real = 0.0) -> State:
         """The state nearest to the poses of the parts with all joints closed.
 
-        With other `args` than the scene's own where lengths or points have changed.
+        With other `args` than the scene's own where lengths or points have changed, at
+        another time where drives start elsewhere. Velocities that parts tell are kept, and
+        those that they leave out follow by the joints; what these leave open moves with
+        the least kinetic energy.
 
-        **Raises:** as `initial_state`, with the name of the joint that is to blame.
+        **Raises:** as `initial_state`, with the name of the joint that is to blame; where
+        values are known also for velocities that no joint allows, and for drives that are
+        not smooth at `t`. `ValueError` for a pose opposite to a driven angle in space,
+        under `jit`, `vmap` and `grad` `equinox.EquinoxRuntimeError`.
         """
         args = self.args if args is None else args
-        try:
-            return initial_state(self.system, self.q, self.v, args)
-        except ValueError as error:
-            name = first_dependent(self._layout, self.q, args, self._rows)
-            if name is None:
-                raise
-            raise ValueError(
-                f"{error} In this scene '{name}' repeats what other joints hold already."
-            ) from None
+        told = Told(State(self.q, self.v), self._given)
+        return closed_start(self._layout, self.system, told, t, args, self._rows)
 
-    def report(self, state: State | None = None) -> dict[str, Gap]:
+    def report(
+        self,
+        state: State | None = None,
+        args: Parameters | None = None,
+        *,
+        t: Real = 0.0,
+    ) -> dict[str, Gap]:
         """How far each joint is from closed, by name: in the start as the parts tell it,
-        or in another state, such as `start()`.
+        or in another state, such as `start()`, at its time `t`.
 
-        `position` is a length (an angle counts as an arc of the size of the scene),
-        `velocity` its rate.
+        `position` is a length (an angle counts as an arc of the size of its bodies),
+        `velocity` its rate; velocities that the parts leave out count as zero.
         """
-        return self._gaps(state)[0]
+        found = self._gaps(state, t, args)
+        return {name: Gap(gap.position, gap.velocity) for name, gap in found.items()}
 
-    def mobility(self, state: State | None = None, *, t: Real = 0.0) -> Mobility:
-        """The freedoms of the scene in a pose, its start if none is given; see `mobility`.
+    def mobility(
+        self,
+        state: State | None = None,
+        args: Parameters | None = None,
+        *,
+        t: Real = 0.0,
+    ) -> Mobility:
+        """The freedoms of the scene in a pose, that of its parts if none is given; see
+        `mobility`.
 
         Rows are named by their joint, `"hinge[0]"`; those within bodies by their number.
+        Those are redundant that follow from rows before them; first come those within
+        bodies.
         """
         state = State(self.q, self.v) if state is None else state
-        names = row_names(self._layout, self.q, self.args, self._rows)
-        return mobility(self.system, state, self.args, t=t, names=names)
+        args = self.args if args is None else args
+        names = row_names(self._layout, self.q, args, self._rows)
+        joined = {k for x in self._rows.values() for k in range(x.start, x.stop)}
+        own = [k for k in range(len(names)) if k not in joined]
+        return freedoms(self.system, state, args, t, names, own)
 
     def position(self, ys: State, body: str, point: Vector | None = None) -> Array:
         """A point of a body in space along a run, shape `(times, d)`; of one state `(d,)`.
 
-        `point` is told in the frame of the body; its mass centre if it is not given.
+        `point` is told in the frame of the body; its mass centre if it is not given. A
+        batch of runs has its axes before that of time.
         """
         return self._along(lambda q, v: View(self._layout, q).position(body, point), ys)
 
@@ -176,72 +182,56 @@ class Scene:
         return self._along(lambda q, v: View(self._layout, q).angle(body), ys)
 
     def reaction(
-        self, sol: Solution | ConsistentStart, joint: str, args: Parameters | None = None
+        self,
+        sol: Solution | ConsistentStart | Equilibrium,
+        joint: str,
+        args: Parameters | None = None,
     ) -> Reaction:
-        """Force and torque of a joint or drive on its second body, along a run or at a
-        start.
+        """Force and torque of a joint or drive on its second body, along a run, at a start
+        or in an equilibrium.
 
         `args` are those of the run, where they are not the scene's own. Multipliers of a
         run are means over the step that ends at a row, and are taken to act there.
         """
-        args = self.args if args is None else args
-        if joint not in self._rows or joint not in self._ends:
-            raise ValueError(f"There is no joint '{joint}'; there are {[*self._rows]}.")
-        group, numbers = self._link(joint, args)
-
-        def at(q: Coordinates, multipliers: Array) -> tuple[Point, Array]:
-            a, b = (View(self._layout, q).frame(body) for body in self._ends[joint])
-            return reaction(group, a, b, numbers, multipliers)
-
-        ys = sol.state if isinstance(sol, ConsistentStart) else sol.ys
-        at = at if ys.q.ndim == 1 else jax.vmap(at)
-        return Reaction(*at(ys.q, self.multipliers(sol, joint)))
-
-    def _link(self, joint: str, args: Parameters) -> tuple[Links, Numbers]:
-        places = self._layout.places
-        if joint in places["joints"]:
-            number, _ = places["joints"][joint]
-            return self._layout.joint_groups[number], args["joints"][joint]
-        number, _ = places["drives"][joint]
-        group = self._layout.drive_groups[number]
-        assert isinstance(group.law, Driven)
-        # What it prescribes has the slope of its measure.
-        return group._replace(law=group.law.measure), args["drives"][joint]
+        if joint in self._rows and joint not in self._ends:
+            raise ValueError(
+                f"'{joint}' is a constraint of your own, between no two bodies: it has "
+                f"`scene.multipliers(sol, '{joint}')`, and `-B^T` of these is its force."
+            )
+        if joint not in self._rows:
+            joints = [name for name in self._rows if name in self._ends]
+            raise ValueError(f"There is no joint '{joint}'; there are {joints}.")
+        at_rest = isinstance(sol, ConsistentStart | Equilibrium)
+        ys = sol.state if at_rest else sol.ys
+        args, ends = self.args if args is None else args, self._ends[joint]
+        of_state = lambda q, x: reaction(self._layout, q, x, joint, ends, args)
+        return each(of_state, ys.q, self.multipliers(sol, joint))
 
     def multipliers(
-        self, sol: Solution | ConsistentStart, joint: str
+        self, sol: Solution | ConsistentStart | Equilibrium, joint: str
     ) -> Float[Array, "... rows"]:
         """The multipliers of a joint, constraint or drive, one column for each row."""
         return sol.multipliers[..., self._rows[joint]]
 
     def __str__(self) -> str:
-        return summary(self._layout, self._kinds, self._ends, self._rows)
+        may_repeat, freedoms = self.system.redundant, self._freedoms()
+        parts = self._kinds, self._ends, self._rows
+        return summary(self._layout, *parts, may_repeat, freedoms)
+
+    def _freedoms(self) -> int | None:
+        """Degrees of freedom at the start of a redundant scene, if it has one."""
+        if not self.system.redundant or not is_known((self.q, self.v, self.args)):
+            return None
+        try:
+            return self.mobility(self.start()).degrees_of_freedom
+        except ValueError:  # of a scene that cannot be closed
+            return None
 
     def _along(self, function: Any, ys: State) -> Array:
-        return (jax.vmap(function) if ys.q.ndim == 2 else function)(ys.q, ys.v)
+        return each(function, ys.q, ys.v)
 
-    def _gaps(self, state: State | None = None) -> tuple[dict[str, Gap], float]:
-        """The gaps by name, and the size of the scene."""
+    def _gaps(
+        self, state: State | None, t: Real, args: Parameters | None
+    ) -> dict[str, Measured]:
         state = State(self.q, self.v) if state is None else state
-        rates = lift(self._layout, state.q, state.v)
-        found, size = jax.device_get(gaps(self._layout, state.q, rates, self.args))
-        named = {
-            name: Gap(float(x), float(v))
-            for names, (xs, vs) in zip(members(self._layout), found, strict=True)
-            for name, x, v in zip(names, xs, vs, strict=True)
-        }
-        return named, float(size)
-
-    def _check_gaps(self) -> None:
-        if not self._rows or not is_known((self.q, self.v, self.args)):
-            return
-        found, size = self._gaps()
-        for name, gap in found.items():
-            if gap.position > _FAR * size and name in self._ends:
-                a, b = self._ends[name]
-                raise ValueError(
-                    f"'{name}' is off by {gap.position:.3g} at the start, in a scene of "
-                    f"size {size:.3g}: the poses of '{a}' and '{b}' do not fit its points, "
-                    "axes or length. Those are told in the frames of the bodies, whose "
-                    "origin is the mass centre."
-                )
+        return gaps_of(self._layout, state, t, self.args if args is None else args)

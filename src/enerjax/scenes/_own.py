@@ -1,0 +1,45 @@
+"""Functions of the user's own: what is wrong with one is told with the name of its part."""
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+
+from .._types import Multipliers
+
+
+def check_function(part: str, role: str, value: Any, *inputs: str) -> None:
+    """Raises for what is no function of these."""
+    wanted = f"`{role}` of '{part}' must be a function of ({', '.join(inputs)}), "
+    if not callable(value):
+        raise TypeError(f"{wanted}got {type(value).__name__}.")
+    try:
+        inspect.signature(value).bind(*inputs)
+    except TypeError as error:
+        raise TypeError(f"{wanted}and cannot be called so: {error}.") from None
+    except ValueError:  # no signature to be had
+        pass
+
+
+def ask(part: str, function: Callable, *inputs: Any) -> Any:
+    """Its value; a number that it does not find is told."""
+    try:
+        return function(*inputs)
+    except KeyError as error:
+        raise ValueError(
+            f"The function of '{part}' asks for {error}, which is not there. Numbers for "
+            "functions of your own are given as `Scene(..., args={...})`, those of a curve "
+            "with it."
+        ) from None
+
+
+def vector_of(part: str, function: Callable, *inputs: Any) -> Multipliers:
+    """Its value, which must be a vector."""
+    rows = ask(part, function, *inputs)
+    if jnp.ndim(rows) != 1:
+        raise ValueError(
+            f"The function of '{part}' must return a vector, got shape {jnp.shape(rows)}. "
+            "Wrap a single constraint as `jnp.array([value])`."
+        )
+    return rows
