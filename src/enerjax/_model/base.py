@@ -134,7 +134,7 @@ class AbstractModel(eqx.Module):
     def stiffness(
         self, state: State, multipliers: Multipliers
     ) -> tuple[Float[Array, "nq nq"] | Assembled, Symmetric]:
-        """`Hess_q (H + lambda . Phi)`, assembled of elements if it can be, and the inertia."""
+        """`Hess_q (H + lambda . Phi)`, of elements if it can be, and the inertia."""
 
     @abc.abstractmethod
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
