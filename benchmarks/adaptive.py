@@ -96,9 +96,16 @@ def our_rows(quick: bool) -> list[harness.Row]:
 
             def run(h, controller, scheme=scheme, system=system, start=start, args=args):
                 bound = COUNTS[-1] if controller is None else MAX_STEPS
-                options = dict(t1=t1, ts=ts, max_steps=bound, throw=False)  # noqa: B023
+                options: Any = dict(t1=t1, ts=ts, max_steps=bound)  # noqa: B023
                 return ej.simulate(
-                    system, scheme, start, args, h=h, controller=controller, **options
+                    system,
+                    scheme,
+                    start,
+                    args,
+                    h=h,
+                    controller=controller,
+                    throw=False,
+                    **options,
                 )
 
             fixed = jax.jit(lambda h, run=run: run(h, None))

@@ -22,8 +22,8 @@ def adaptive(name, scheme, tolerance, t1, args=None, **options):
     system, start, own = problem(name) if isinstance(name, str) else name
     args = own if args is None else args
     controller = ej.StepController(tolerance, tolerance)
-    options: dict[str, Any] = dict(h=0.01, max_steps=512, controller=controller) | options
-    return ej.simulate(system, scheme, start, args, t1=t1, **options)
+    given: dict[str, Any] = dict(h=0.01, max_steps=512, controller=controller) | options
+    return ej.simulate(system, scheme, start, args, t1=t1, **given)
 
 
 def tried(sol):

@@ -173,13 +173,14 @@ def _run(
     ts, states, multipliers, details, energies = saved
     passed = (ts - t0) / duration
     rejected = None if isinstance(pace, EqualSteps) else end.attempts - end.completed
+    iterations, residuals, halvings = steps.costs
     solution = Solution(
         ts,
         jax.vmap(model.leave)(states),
         multipliers,
         details,
         audit(model, jax.vmap(timed)(states, passed), *energies),
-        Statistics(*steps.costs, end.completed, rejected),
+        Statistics(iterations, residuals, halvings, end.completed, rejected),
         model.leave(end.state),
         result,
     )
