@@ -48,7 +48,13 @@ ESTIMATED = {
 }
 
 
-@pytest.mark.parametrize("name", ESTIMATED)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name == "preserving" else pytest.mark.slow)
+        for name in ESTIMATED
+    ],
+)
 def test_the_estimate_tends_to_the_error_of_a_step(name):
     scheme, begin = ESTIMATED[name], double_pendulum_reference(0.9)
     system, _, args = problem("double")
@@ -106,6 +112,7 @@ def test_the_energy_balance_holds_at_round_off_while_steps_vary():
     assert float(jnp.nanmax(jnp.abs(audit.constraint_rate))) < 1e-12
 
 
+@pytest.mark.slow
 def test_requested_rows_count_the_energy_of_the_steps_that_have_ended():
     steps = damped_run()
     ts = [0.0, 0.7123, 1.3, 2.0]
@@ -123,6 +130,7 @@ def test_requested_rows_count_the_energy_of_the_steps_that_have_ended():
 # Fewer steps ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_an_eccentric_planet_takes_a_third_of_the_steps():
     planet, period = ej.problems.kepler(0.9), 2 * np.pi
     system, start, args = planet
@@ -188,6 +196,7 @@ def batch_of_ends():
     return jax.vmap(end_of)(jnp.array([9.81, 30.0]))
 
 
+@pytest.mark.slow
 def test_lanes_choose_their_own_steps():
     q, (ts, stats) = batch_of_ends()
     assert stats.completed_steps[0] < stats.completed_steps[1]

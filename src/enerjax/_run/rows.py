@@ -29,7 +29,7 @@ class Step(eqx.Module):
     energies: PyTree[Float[Array, " steps"]]
     passed: Float[Array, " steps"]
     accepted: Bool[Array, " steps"]
-    costs: PyTree[Array]
+    costs: tuple[Array, Array, Array]
 
 
 class Run(eqx.Module):
