@@ -82,7 +82,8 @@ def chain_rates(y: np.ndarray, masses: np.ndarray) -> np.ndarray:
     both = inverse + np.append(0.0, inverse[:-1])
     diagonal = both * np.sum(links**2, axis=1)
     side = np.append(0.0, -inverse[:-1] * np.sum(links[1:] * links[:-1], axis=1))
-    tension = solveh_banded(np.stack([side, diagonal]), right)
+    bands = np.stack([side, diagonal])
+    tension = right / diagonal if size == 1 else solveh_banded(bands, right)
     pull = -tension[:, None] * links
     pull[:-1] -= pull[1:]
     return np.concatenate([v.ravel(), (inverse[:, None] * pull + [0.0, G]).ravel()])
