@@ -38,7 +38,6 @@ def test_a_stiff_quartic_spring_is_right_or_says_that_it_failed():
     assert {row.verdict for row in rows if row.x <= 1} == {RIGHT}
 
 
-@pytest.mark.xfail(strict=True, reason="Newton takes small corrections for convergence")
 def test_a_quartic_spring_far_too_stiff_for_the_step_is_not_called_a_success():
     rows = [row for row in steps() if row.case == "quartic spring" and row.x > 100]
     assert WRONG not in {row.verdict for row in rows}

@@ -136,10 +136,12 @@ def newton_iterations(
         ends = ~fresh & ~shrinks & (before.contraction > 0)
         ends = ends & (defect <= eps**0.875) & small
         # So has one with a Jacobian of its own; but where the residual is not tiny
-        # (coordinates a million lengths off) only if it happens again and again.
+        # (coordinates a million lengths off) only if it happens again and again, and never
+        # where it is not small: a residual can have a smallest value that is no root.
         stalled = fresh & ~shrinks & small
         stalls = jnp.where(fresh, jnp.where(stalled, before.stalls + 1, 0), before.stalls)
-        ends = ends | (stalled & ((defect <= eps**0.75) | (stalls == _STALLS)))
+        again_and_again = (stalls == _STALLS) & (defect <= eps**0.5)
+        ends = ends | (stalled & ((defect <= eps**0.75) | again_and_again))
         done = (converged | is_root | ends) & jnp.isfinite(size)
         kept = fresh | shrinks | is_root
         broken = fresh & ~jnp.isfinite(size)
