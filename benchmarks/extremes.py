@@ -5,8 +5,9 @@
 One row for each axis, case and scheme: what was asked, what happened, the error against
 something independent (a closed form, an ODE solver in minimal coordinates, the same run
 at unit scale), the energy that the balance does not explain, both levels of the
-constraints, the iterations, and a verdict: `right`, `reported failure`, or `WRONG` for a
-success that is off by more than truncation and round-off leave. Writes extremes.csv and
+constraints, the iterations, and a verdict: `right`, `law holds` where only the balance can
+be judged, `reported failure`, or `WRONG` for a success that is off by more than truncation
+and round-off leave. Writes extremes.csv and
 extremes.png.
 """
 
@@ -66,7 +67,7 @@ def write_csv(rows: list, path: Path) -> None:
         writer.writerows(dataclasses.asdict(row) for row in rows)
 
 
-COLOURS = {"right": "C2", "reported failure": "C1", "WRONG": "C3"}
+COLOURS = {"right": "C2", "law holds": "C0", "reported failure": "C1", "WRONG": "C3"}
 
 
 def draw(rows: list, path: Path) -> None:
