@@ -5,22 +5,25 @@
 import statistics
 import sys
 import time
+from collections.abc import Sequence
 
 
 sys.exudynFast = True  # pyright: ignore[reportAttributeAccessIssue]
 
 import exudyn as exu  # noqa: E402
 import exudyn.utilities as eu  # noqa: E402
+import numpy as np  # noqa: E402
 
 
-def _build(num_links: int):
+def _build(masses: Sequence[float], length: float):
     container = exu.SystemContainer()
     system = container.AddSystem()
     ground = system.AddObject(eu.ObjectGround())
     last = system.AddMarker(eu.MarkerBodyPosition(bodyNumber=ground))
-    length = mass = 1 / num_links
-    for k in range(1, num_links + 1):
+    nodes = []
+    for k, mass in enumerate(masses, start=1):
         node = system.AddNode(eu.NodePoint2D(referenceCoordinates=[k * length, 0]))
+        nodes.append(node)
         body = system.AddObject(eu.MassPoint2D(mass=mass, nodeNumber=node))
         marker = system.AddMarker(eu.MarkerBodyPosition(bodyNumber=body))
         system.AddLoad(eu.Force(markerNumber=marker, loadVector=[0, 9.81 * mass, 0]))
@@ -28,21 +31,49 @@ def _build(num_links: int):
         system.AddObject(eu.DistanceConstraint(markerNumbers=ends, distance=length))
         last = marker
     system.Assemble()
-    return container, system
+    return container, system, nodes
 
 
-def us_per_step(num_links: int, h: float, steps: int, repeats: int = 3) -> float:
+def _settings(h: float, steps: int, rho: float, is_sparse: bool):
     settings = exu.SimulationSettings()
     settings.timeIntegration.numberOfSteps = steps
     settings.timeIntegration.endTime = steps * h
     settings.timeIntegration.verboseMode = 0
-    settings.timeIntegration.generalizedAlpha.spectralRadius = 0.5
+    settings.timeIntegration.generalizedAlpha.spectralRadius = rho
     settings.solution.file.write = False
-    settings.linearSolver.solverType = exu.LinearSolverType.EigenSparse
+    kinds = exu.LinearSolverType
+    settings.linearSolver.solverType = kinds.EigenSparse if is_sparse else kinds.EXUdense
     settings.parallel.numberOfThreads = 1
+    return settings
+
+
+def end(
+    masses: Sequence[float], length: float, h: float, end: float, rho: float
+) -> np.ndarray:
+    """Positions at the end of a run."""
+    return end_state(masses, length, h, end, rho)[0]
+
+
+def end_state(
+    masses: Sequence[float], length: float, h: float, end: float, rho: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and velocities at the end of a run."""
+    _container, system, nodes = _build(masses, length)
+    settings = _settings(h, round(end / h), rho, len(masses) > 8)
+    system.SolveDynamic(settings, solverType=exu.DynamicSolverType.GeneralizedAlpha)
+    kinds = exu.OutputVariableType
+    q, v = (
+        np.concatenate([system.GetNodeOutput(node, kind)[:2] for node in nodes])
+        for kind in (kinds.Position, kinds.Velocity)
+    )
+    return q, v
+
+
+def us_per_step(num_links: int, h: float, steps: int, repeats: int = 3) -> float:
+    settings = _settings(h, steps, 0.5, True)
     times = []
     for _ in range(repeats):
-        container, system = _build(num_links)
+        container, system, _ = _build([1 / num_links] * num_links, 1 / num_links)
         begin = time.perf_counter()
         system.SolveDynamic(settings, solverType=exu.DynamicSolverType.GeneralizedAlpha)
         times.append(time.perf_counter() - begin)

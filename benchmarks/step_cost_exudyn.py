@@ -61,18 +61,31 @@ def _top():
     return container, system, lambda: system.GetNodeOutput(body["nodeNumber"], position)
 
 
-def _row(
-    work: str, build: Callable, h: float, end: float, exact: np.ndarray, repeats: int
-) -> dict:
-    steps = round(end / h)
+def end_of_top(h: float, end: float) -> np.ndarray:
+    """The position of the top at the end of a run."""
+    _container, system, position = _top()
+    settings = _settings(h, round(end / h))
+    system.SolveDynamic(settings, solverType=exu.DynamicSolverType.GeneralizedAlpha)
+    return np.asarray(position())
+
+
+def _settings(h: float, steps: int):
     settings = exu.SimulationSettings()
     settings.timeIntegration.numberOfSteps = steps
-    settings.timeIntegration.endTime = end
+    settings.timeIntegration.endTime = steps * h
     settings.timeIntegration.verboseMode = 0
     settings.timeIntegration.generalizedAlpha.spectralRadius = 0.9
     settings.solution.file.write = False
     settings.linearSolver.solverType = exu.LinearSolverType.EXUdense
     settings.parallel.numberOfThreads = 1
+    return settings
+
+
+def _row(
+    work: str, build: Callable, h: float, end: float, exact: np.ndarray, repeats: int
+) -> dict:
+    steps = round(end / h)
+    settings = _settings(h, steps)
     times, error = [], np.inf
     for _ in range(repeats):
         container, system, position = build()

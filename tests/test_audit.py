@@ -148,3 +148,44 @@ def test_a_fast_oscillation_shrinks_by_the_spectral_radius(scheme, rho_inf):
     amplitude = float(jnp.sqrt(energies[1] / energies[0]))
     # Truncation in 1 / (h w), with h w = 1e5.
     assert amplitude == pytest.approx(rho_inf, abs=1e-4)
+
+
+def _turning(q, args):
+    """Both points turn about the z axis, and move along it."""
+    up = jnp.array([0.0, 0.0, 1.0])
+    turn = jnp.concatenate([jnp.cross(up, q[:3]), jnp.cross(up, q[3:])])
+    return jnp.stack([turn, jnp.concatenate([up, up])])
+
+
+def test_the_momenta_of_named_symmetries_are_followed():
+    def potential(q, args):
+        x = q[:3] - q[3:]
+        return 0.5 * args["k"] * (x @ x - 1.0) ** 2
+
+    args = dict(k=10.0)
+    system = ej.System(jnp.eye(6), potential, symmetry=_turning)
+    start = ej.initial_state(system, [0, 0, 0, 1, 0.1, 0], [0, 0.1, 1, 0, 1, 0], args)
+    for scheme, bound in ((ej.EnergyPreserving(), 1e-14), (ej.EnergyDecaying(1.0), 1e-2)):
+        audit = ej.simulate(system, scheme, start, args, h=0.02, num_steps=100).audit
+        # By hand: x times v, summed.
+        q, v = np.asarray(start.q), np.asarray(start.v)
+        angular = sum(np.cross(q[k : k + 3], v[k : k + 3])[2] for k in (0, 3))
+        np.testing.assert_allclose(audit.momentum[0], [angular, v[2] + v[5]], atol=1e-15)
+        drift = np.abs(np.asarray(audit.momentum) - np.asarray(audit.momentum[0]))
+        # Round-off; truncation of the decaying scheme in the angular momentum.
+        assert np.max(drift) <= 10 * bound
+        assert np.max(drift[:, 1]) <= 1e-13
+
+
+def test_an_audit_tells_itself_in_short():
+    system, start, args = problem("spring")
+    run = functools.partial(
+        ej.simulate, system, start=start, args=args, num_steps=200, throw=False
+    )
+    text = str(run(ej.EnergyDecaying(0.5), h=STEP["spring"]).audit)
+    assert "201 rows" in text
+    assert "removed by the scheme" in text
+    assert "unaccounted for" in text
+    cut = str(run(ej.EnergyDecaying(0.5), h=100.0).audit)
+    assert "before a failure" in cut
+    assert "nan" not in cut

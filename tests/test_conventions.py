@@ -19,7 +19,7 @@ TESTS = sorted(pathlib.Path(__file__).parent.glob("*.py"))
 # Each imports only from lower layers: from what stands further up.
 LAYERS = [
     {"_types", "_tracing", "_fast_loops"},
-    {"_results"},
+    {"_results", "_lanes"},
     {"_discrete"},
     {"_linear"},
     {"_kinematics", "_newton"},
@@ -29,15 +29,11 @@ LAYERS = [
     {"_audit"},
     {"_schemes", "_scaling", "_solution"},
     {"_check"},
-    {"_solve"},
-    {"_step", "_projection", "_reverse", "_analysis", "_diffrax"},
-    {"_initial"},
-    {"_simulate"},
-    {"_measure"},
-    {"scenes"},
-    {"problems"},
-    {"_report"},
-    {"__main__"},
+    *({"_solve"}, {"_divided"}),
+    {"_step", "_projection", "_analysis", "_diffrax"},
+    {"_initial", "_run"},
+    *({"_measure"}, {"_sweep"}, {"_identify"}),
+    *({name} for name in ("scenes", "problems", "_report", "__main__")),
 ]
 LAYER = {name: number for number, names in enumerate(LAYERS) for name in names}
 
@@ -118,7 +114,7 @@ def test_schemes_know_no_solver():
 
 
 def test_the_run_knows_no_scheme_by_name():
-    for name in ("_step", "_simulate", "_check", "_scaling"):
+    for name in ("_step", "_run", "_check", "_scaling"):
         for path in files_of(name):
             for module, names in imports(path):
                 if module.startswith("enerjax._schemes"):

@@ -7,7 +7,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import enerjax as ej
-from enerjax import _reverse
+from enerjax._run import reverse as reverse_pass
 
 from .helpers import problem, SCHEMES
 
@@ -98,7 +98,7 @@ def tip(g, steps, save_every):
 @pytest.mark.parametrize(("steps", "long"), [(100, False), (101, False), (103, True)])
 def test_saving_less_does_not_change_the_gradient(steps, long, monkeypatch):
     """What the reverse pass computes again is what the run computed."""
-    monkeypatch.setattr(_reverse, "LONG", 10 if long else _reverse.LONG)
+    monkeypatch.setattr(reverse_pass, "LONG", 10 if long else reverse_pass.LONG)
     forward = jax.jvp(lambda g: tip(g, steps, 1), (9.81,), (1.0,))[1]
     assert abs(forward) > 1e-3
     for save_every in (1, 20 if steps == 100 else steps):

@@ -22,6 +22,11 @@ from ._discrete import (
     MeanValue as MeanValue,
 )
 from ._fast_loops import enable_fast_loops as enable_fast_loops
+from ._identify import (
+    Fit as Fit,
+    fit as fit,
+    multiple_shooting as multiple_shooting,
+)
 from ._initial import (
     consistent_start as consistent_start,
     ConsistentStart as ConsistentStart,
@@ -36,6 +41,7 @@ from ._measure import (
 )
 from ._newton import Newton as Newton
 from ._results import RESULTS as RESULTS
+from ._run import simulate as simulate, StepController as StepController
 from ._schemes import (
     AbstractScheme as AbstractScheme,
     Composed as Composed,
@@ -46,9 +52,9 @@ from ._schemes import (
     KappaDecaying as KappaDecaying,
     Rattle as Rattle,
 )
-from ._simulate import simulate as simulate
 from ._solution import Solution as Solution, Statistics as Statistics
 from ._step import step as step, StepOutput as StepOutput, Warm as Warm
+from ._sweep import Sweep as Sweep, sweep as sweep
 from ._system import (
     AbstractSystem as AbstractSystem,
     Elements as Elements,

@@ -1,23 +1,33 @@
-"""Energies and constraint residuals along a run, to judge it by."""
+"""Energies, momenta and constraint residuals along a run, to judge it by."""
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ._model import AbstractModel
 from ._system import State
+from ._tracing import is_known
 
 
 class Audit(eqx.Module):
     """What a run did to the energy and to the constraints, at each saved time.
 
+    `print(solution.audit)` tells it in short.
+
     - `kinetic`, `potential`, `energy`: shape `(times,)` (energy).
     - `dissipated`: shape `(times,)`, the energy that the scheme removed since the row
       before, by its own identity; 0 in row 0.
-    - `work`, `drive_work`: shape `(times,)`, the work of `force` and that of `driven`
-      constraints on the system since the row before; 0 where the system has none.
-      `energy[k] = energy[k-1] + work[k] + drive_work[k] - dissipated[k]` up to round-off
-      and what Newton left.
+    - `work`, `drive_work`: shape `(times,)`, the work of `force` (of dampers it is
+      negative) and that of `driven` constraints on the system since the row before; 0
+      where the system has none. Joints do no work: their discrete gradient is orthogonal
+      to what they hold.
+    - `leak`: shape `(times,)`, what this leaves of the change of the energy since the row
+      before, `energy[k] = energy[k-1] + work[k] + drive_work[k] - dissipated[k] + leak[k]`:
+      round-off, what Newton left, and what a scheme without an energy identity loses on
+      joints. Not of the size of round-off: do not believe the run.
+    - `momentum`: shape `(times, ns)`, of each `symmetry` of the system.
     - `constraint`: shape `(times, nc)`, residuals of the constraints: joints, driven ones,
       relations between coordinates, in their own units.
     - `constraint_rate`: shape `(times, nj)`, residuals of joints and driven constraints
@@ -29,12 +39,21 @@ class Audit(eqx.Module):
     dissipated: Float[Array, " times"]
     work: Float[Array, " times"]
     drive_work: Float[Array, " times"]
+    momentum: Float[Array, "times ns"]
     constraint: Float[Array, "times nc"]
     constraint_rate: Float[Array, "times nj"]
 
     @property
     def energy(self) -> Float[Array, " times"]:
         return self.kinetic + self.potential
+
+    @property
+    def leak(self) -> Float[Array, " times"]:
+        change = jnp.diff(self.energy, prepend=self.energy[..., :1])
+        return change - self.work - self.drive_work + self.dissipated
+
+    def __str__(self) -> str:
+        return _report(self) if is_known(self) else repr(self)
 
 
 def audit(
@@ -50,11 +69,12 @@ def audit(
         return (
             model.kinetic(state),
             model.potential(state),
+            model.symmetry_momenta(state),
             model.constraint(state.q, state.t),
             model.joint_rate(state.q, state.v, state.t),
         )
 
-    kinetic, potential, constraint, rate = jax.vmap(at)(states)
+    kinetic, potential, momentum, constraint, rate = jax.vmap(at)(states)
     # Where a row is not a number, none of its entries is.
     none = 0 * dissipated
     return Audit(
@@ -63,6 +83,49 @@ def audit(
         dissipated,
         none if work is None else work,
         none if drive_work is None else drive_work,
+        momentum,
         constraint,
         rate,
     )
+
+
+def _report(audit: Audit) -> str:
+    """One line for each kind of entry; of a batch the worst lane."""
+    rows = np.isfinite(np.asarray(audit.energy))
+    kept = lambda x: np.where(rows, np.asarray(x), 0.0)
+    total = lambda x: _worst(np.sum(kept(x), axis=-1))
+    largest = lambda x: np.nanmax(np.abs(np.asarray(x)), initial=0.0)
+    momentum = np.asarray(audit.momentum)
+    lines = [
+        ("energy, change over the run", _worst(_last(audit.energy) - audit.energy[..., 0])),
+        ("  removed by the scheme", total(audit.dissipated)),
+        ("  work of forces", total(audit.work)),
+        ("  work of drives", total(audit.drive_work)),
+        ("  unaccounted for (sum)", total(audit.leak)),
+        ("  unaccounted for (largest row)", largest(audit.leak)),
+        ("largest kinetic energy", largest(audit.kinetic)),
+        ("constraints, largest residual", largest(audit.constraint)),
+        ("  of velocities", largest(audit.constraint_rate)),
+    ]
+    for k in range(momentum.shape[-1]):
+        drift = momentum[..., k] - momentum[..., :1, k]
+        lines.append((f"momentum {k}, largest change", largest(drift)))
+    done = rows.sum(axis=-1)
+    what = f"{rows.shape[-1]} rows" + (
+        "" if rows.all() else f", {done.min()} of them before a failure"
+    )
+    if rows.ndim > 1:
+        what += f", the worst of {rows[..., 0].size} runs"
+    width = max(len(name) for name, _ in lines)
+    return "\n".join([what, *(f"{name:{width}}  {x: .3e}" for name, x in lines)])
+
+
+def _last(x: Array) -> np.ndarray:
+    """The last entry of each lane that is a number."""
+    last = np.isfinite(np.asarray(x)).sum(axis=-1) - 1
+    return np.take_along_axis(np.asarray(x), last[..., None], axis=-1)[..., 0]
+
+
+def _worst(x: np.ndarray) -> float:
+    flat = np.ravel(x)
+    return float(flat[np.argmax(np.abs(flat))])

@@ -79,6 +79,8 @@ class _Iterate(eqx.Module):
     jacobians: Count
     # Jacobians in a row after which the correction was small and did not shrink.
     stalls: Count
+    # Size of the residual that the last correction was made from.
+    defect: Scalar
     # Whether the factors are of the Jacobian at `x`, and whether they should become so.
     fresh: Flag
     stale: Flag
@@ -151,6 +153,7 @@ def newton_iterations(
             before.corrections + kept.astype(before.corrections.dtype),
             jnp.where(again, _PATIENCE + 1, before.jacobians),
             stalls,
+            defect,
             jnp.zeros_like(fresh),
             ~kept | again,
             done,
@@ -160,7 +163,9 @@ def newton_iterations(
     infinite, zero = jnp.asarray(jnp.inf, x0.dtype), jnp.zeros((), x0.dtype)
     none, no = jnp.array(0), jnp.array(False)
     factors, yes = residual.first_factors(start.factors, x0), jnp.array(True)
-    first = _Iterate(x0, factors, infinite, zero, none, none, none, no, yes, start.skip, no)
+    first = _Iterate(
+        x0, factors, infinite, zero, none, none, none, zero, no, yes, start.skip, no
+    )
     unfinished = lambda c: (
         ~(c.done | c.broken) & ~(c.stale & (c.jacobians >= max_jacobians))
     )

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ._types import Flag
+from ._types import Flag, Scalar
 
 
 class RESULTS(eqx.Enumeration):
@@ -13,14 +13,24 @@ class RESULTS(eqx.Enumeration):
     successful = ""
     not_converged = (
         "Newton's method did not converge. The step may be too long for the motion: "
-        "reduce `h`. Light masses between heavy ones or stiff springs want "
-        "`EnergyConsistent(1.0)` or `EnergyDecaying(1.0)`, which damp what the step "
-        "cannot resolve."
+        "reduce `h`, or let steps that fail be divided: `max_halvings=3`. Light masses "
+        "between heavy ones or stiff springs want `EnergyConsistent(1.0)` or "
+        "`EnergyDecaying(1.0)`, which damp what the step cannot resolve."
+    )
+    singular = (
+        "The step equations became singular. Constraints may repeat each other (declare "
+        "that: `System(..., redundant=True)`; `enerjax.mobility` names their rows), or the "
+        "mechanism passes a pose where they lose their independence: another `h` may miss "
+        "it."
     )
     nonfinite = (
-        "The step equations became singular or non-finite. Constraints may be redundant "
-        "or the pose singular, a function of the system may be undefined there (a "
-        "division by zero, a root of a negative number), or `h` is far too long."
+        "The step equations became non-finite. A function of the system may be undefined "
+        "there (a division by zero, a root of a negative number), or `h` is far too long."
+    )
+    step_too_large = (
+        "A constraint turned by more than a right angle in this step: the step is far too "
+        "long for the motion, or has met a solution on the other side of a joint. Reduce "
+        "`h`, or let steps that fail be divided: `max_halvings=3`."
     )
     inconsistent_start = (
         "The start does not satisfy the constraints that this scheme holds. Make it "
@@ -32,6 +42,16 @@ class RESULTS(eqx.Enumeration):
         "more. This is a limit of the scheme, not of the step: use `EnergyDecaying` or "
         "`EnergyConsistent`."
     )
+    out_of_steps = (
+        "The end time is not reached within `max_steps`. Raise `max_steps`, lengthen `h`, "
+        "or loosen the tolerances of the controller."
+    )
+    steps_too_short = (
+        "The tolerances of the controller ask for steps that vanish beside the length of "
+        "the run. Loosen `rtol` and `atol`: what Newton's method leaves, about 1e-14 of "
+        "the coordinates, is not below any tolerance; or the motion has a singularity "
+        "here (a collision)."
+    )
 
 
 def first_failure(old: RESULTS, new: RESULTS) -> RESULTS:
@@ -39,9 +59,10 @@ def first_failure(old: RESULTS, new: RESULTS) -> RESULTS:
     return RESULTS.where(old == RESULTS.successful, new, old)
 
 
-def from_root_finder(found: Flag, broken: Flag) -> RESULTS:
+def from_root_finder(found: Flag, broken: Flag, residual: Scalar) -> RESULTS:
     """What the end of an iteration means for a step."""
-    failure = RESULTS.where(broken, RESULTS.nonfinite, RESULTS.not_converged)
+    breakdown = RESULTS.where(jnp.isfinite(residual), RESULTS.singular, RESULTS.nonfinite)
+    failure = RESULTS.where(broken, breakdown, RESULTS.not_converged)
     return RESULTS.where(found, RESULTS.successful, failure)
 
 

@@ -17,9 +17,9 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from ._linear import AbstractFactors, kept_factors, linearisable
-from ._newton import Newton, newton_iterations, Start
+from ._newton import max_norm, Newton, newton_iterations, Start
 from ._tracing import is_known
-from ._types import Count, Flag
+from ._types import Count, Flag, Scalar
 
 
 # The name under which a policy of `jax.checkpoint` knows the value of a root.
@@ -33,13 +33,15 @@ class Root(eqx.Module):
     - `value`: the unknowns.
     - `factors`: for the next solve.
     - `iterations`: corrections made.
+    - `residual`: its largest entry; of `Newton` before the last correction.
     - `found`: whether they converged.
-    - `broken`: whether they became singular or non-finite.
+    - `broken`: whether they became singular, or non-finite with the residual.
     """
 
     value: PyTree[Array]
     factors: AbstractFactors | None
     iterations: Count
+    residual: Scalar
     found: Flag
     broken: Flag
 
@@ -70,14 +72,19 @@ def _search(
             for name in ("successful", "singular", "nonfinite")
         )
         steps = solution.stats["num_steps"]
-        return Root(solution.value, start.factors, steps, found, singular | nonfinite)
+        residual = max_norm(fn(solution.value, args))
+        return Root(
+            solution.value, start.factors, steps, residual, found, singular | nonfinite
+        )
     flat, unravel, flat_fn = _flattened(fn, start.guess)
     given, fill = root_finder.linear_solver, _flat(start.fill)
     residual = linearisable(flat_fn, flat, args, given, fill)
     last = newton_iterations(residual, root_finder, start, max_iterations)
     keeps = residual.keeps_factors and start.factors is not None
     factors = last.factors if keeps else start.factors
-    return Root(unravel(last.x), factors, last.corrections, last.done, last.broken)
+    return Root(
+        unravel(last.x), factors, last.corrections, last.defect, last.done, last.broken
+    )
 
 
 @eqx.filter_custom_jvp
@@ -92,7 +99,7 @@ def _root_jvp(primals, tangents):
     root = _root(fn, root_finder, args, start, max_iterations)
     # All that the derivatives of a step need of the search for it.
     root = eqx.tree_at(
-        lambda root: (root.value, root.found, root.broken),
+        lambda root: (root.value, root.residual, root.found, root.broken),
         root,
         replace_fn=lambda x: jax.tree.map(lambda x: checkpoint_name(x, ROOT), x),
     )

@@ -6,9 +6,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from ._model import AbstractModel, Increment
+from ._model import AbstractModel, force_size, Increment
 from ._system import State
 from ._types import Scalar
+
+
+# What Newton may try to resolve of that round-off. It stops where corrections no longer
+# shrink; a floor at the round-off itself would let stiff springs stop it before.
+_BEYOND = 0.01
 
 
 def scales_like(
@@ -17,16 +22,24 @@ def scales_like(
     """The sizes of the unknowns in `z`, and of the rows that stand in their places."""
     scales = model.scales
     root = jnp.sqrt(model.energy_scale(start, h))
+    forces = jnp.abs(h) * force_size(model, start)
+    # At rest the unknowns are the round-off of the rows, which is far below their floor,
+    # and of the coordinates; Newton compares its corrections with their size.
+    rounding = jnp.maximum(
+        forces / scales.coordinate, scales.coordinate * jnp.abs(start.q / h)
+    )
+    least = jnp.finfo(h.dtype).eps ** 0.5 * jnp.linalg.norm(rounding)
+    unit = jnp.maximum(root, jax.lax.stop_gradient(least))
     is_increment = lambda x: isinstance(x, Increment)
 
     def unknown(x):
         if not is_increment(x):
             return jnp.ones_like(x)
         joint = scales.constraint[: x.velocity_impulse.size]
-        rate = root / scales.coordinate
-        momentum = (root * scales.coordinate)[: x.momentum.size]
-        impulse = (root / scales.constraint)[: x.impulse.size]
-        return Increment(rate, momentum, impulse, root / joint)
+        rate = unit / scales.coordinate
+        momentum = (unit * scales.coordinate)[: x.momentum.size]
+        impulse = (unit / scales.constraint)[: x.impulse.size]
+        return Increment(rate, momentum, impulse, unit / joint)
 
     def row(x):
         if not is_increment(x):
@@ -35,7 +48,8 @@ def scales_like(
         # A constraint is a difference of numbers that can be large against what a step
         # changes: its rows are resolved to the round-off of those.
         position = root * scales.constraint + scales.constraint_size / jnp.abs(h)
-        momentum = root * scales.coordinate
+        # Those of the momenta not much beyond the round-off of the terms of the forces.
+        momentum = jnp.maximum(root * scales.coordinate, _BEYOND * forces)
         rate = (root / scales.coordinate)[: x.momentum.size]
         return Increment(momentum, rate, position[: x.impulse.size], root * joint)
 

@@ -13,11 +13,22 @@ class Statistics(eqx.Module):
     """What a run cost.
 
     - `newton_iterations`: of each step, shape `(num_steps,)`; 0 after a failure.
+    - `residual`: of each step, the largest entry of the step equations, scaled to order
+      one, before the last correction; of the step that failed what Newton came to.
+    - `halvings`: of each step, how often it had to be halved; see `simulate`.
     - `completed_steps`: number of steps before the first failure, or all.
+    - `rejected_steps`: of a run with a `StepController`, how many steps were repeated with
+      another length, the last one of a failed run included; else `None`.
+
+    In a run to an end time there is room for `max_steps`; with a controller rejected steps
+    count and stand among the others.
     """
 
     newton_iterations: Int[Array, " steps"]
+    residual: Float[Array, " steps"]
+    halvings: Int[Array, " steps"]
     completed_steps: Count
+    rejected_steps: Count | None = None
 
 
 class Solution(eqx.Module):
@@ -31,10 +42,18 @@ class Solution(eqx.Module):
     - `details`: what the scheme reports of its own, for the steps that end at the rows
       after the start (`KappaDecaying`: kappa, shape `(times - 1,)`), or `None`.
     - `audit`: energies and constraint residuals.
-    - `stats`: `newton_iterations` and `completed_steps`.
+    - `stats`: what the run cost; see `Statistics`.
+    - `end`: the last state that was reached, after `stats.completed_steps` steps: the last
+      row, or where a failed step began. The start for a run that goes on from there.
     - `result`: `RESULTS.successful`, or the first failure.
 
     Rows after a failed step are NaN; those before it are what they would be without it.
+
+    At times that were requested (`simulate(..., t1=..., ts=...)`) multipliers and details
+    are those of the step that a row lies in or ends. The energies of the audit are those of
+    its state; dissipation and work are those of the steps that have ended since the row
+    before (of the first row since the start). So the balance of the audit is exact between
+    rows at the ends of steps: the start, the end, and all rows of `ts="steps"`.
     """
 
     ts: Float[Array, " times"]
@@ -43,4 +62,5 @@ class Solution(eqx.Module):
     details: PyTree[Any]
     audit: Audit
     stats: Statistics
+    end: State
     result: RESULTS

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from ._linear import AbstractFactors, kept_factors
+from ._linear import AbstractFactors, kept_factors, RowPattern
 from ._model import AbstractModel, Increment
 from ._newton import max_norm
-from ._results import first_failure, first_of, from_root_finder, RESULTS
+from ._results import first_failure, from_root_finder, RESULTS
 from ._root import find_root, RootFinder
 from ._scaling import scales_like
 from ._schemes import AbstractCarryingSolve, AbstractSingleSolve, StepEnd
@@ -26,8 +26,6 @@ from ._types import Count, Flag, Multipliers, Scalar, Velocities
 
 # Enough for the linear convergence of a locking step; a step that needs more has failed.
 MAX_ITERATIONS = 50
-# Into which a step is divided where it fails.
-_PARTS = 8
 
 
 class Memory(eqx.Module):
@@ -44,6 +42,24 @@ class Memory(eqx.Module):
     is_smooth: Flag
     factors: AbstractFactors | None
     carried: PyTree[Any]
+
+
+class Solved(eqx.Module):
+    """A solve, done or failed.
+
+    - `end`: what it leads to.
+    - `iterations`: of Newton.
+    - `residual`: largest entry of the step equations, scaled to order one, before the last
+      correction.
+    - `result`: whether, and how, it failed.
+    - `memory`: for the next.
+    """
+
+    end: StepEnd
+    iterations: Count
+    residual: Scalar
+    result: RESULTS
+    memory: Memory
 
 
 def first_memory(
@@ -89,62 +105,8 @@ def solve(
     memory: Memory,
     root_finder: RootFinder,
     skip: Flag,
-) -> tuple[StepEnd, Count, RESULTS, Memory]:
-    """A step, or, where a large system fails in it, the same step in parts.
-
-    In the whip of a chain the equations of a few steps have no solution that Newton could
-    find; those of shorter steps have. For small systems the second program would cost
-    every step more than it is worth.
-    """
-    whole = _attempt(scheme, model, start, h, memory, root_finder, skip)
-    if memory.factors is not None:
-        return whole
-    _, iterations, result, _ = whole
-    failed = (result != RESULTS.successful) & ~skip
-
-    def in_parts():
-        begin = lambda state, length: first_memory(
-            scheme, model, state, length, *model.accelerations(state)
-        )
-
-        def part(carry, _):
-            state, memory, failed = carry
-            end, iterations, result, memory = _attempt(
-                scheme, model, state, h / _PARTS, memory, root_finder, failed
-            )
-            failed = failed | (result != RESULTS.successful)
-            return (end.state, memory, failed), (end, iterations, result)
-
-        carry = start, begin(start, h / _PARTS), ~failed
-        (state, _, _), parts = jax.lax.scan(part, carry, None, length=_PARTS)
-        ends, counts, results = parts
-        energies = ends.dissipated, ends.work, ends.drive_work
-        dissipated, work, drive_work = jax.tree.map(jnp.sum, energies)
-        end = StepEnd(
-            state,
-            jnp.sum(ends.displacement, axis=0),
-            jnp.mean(ends.multipliers, axis=0),
-            dissipated,
-            work,
-            drive_work,
-            jax.tree.map(lambda x: x[-1], ends.details),
-            first_of(ends.result),
-            jax.tree.map(lambda x: x[-1], ends.carried),
-        )
-        return end, iterations + jnp.sum(counts), first_of(results), begin(state, h)
-
-    return jax.lax.cond(failed, in_parts, lambda: whole)
-
-
-def _attempt(
-    scheme: AbstractSingleSolve,
-    model: AbstractModel,
-    start: State,
-    h: Scalar,
-    memory: Memory,
-    root_finder: RootFinder,
-    skip: Flag,
-) -> tuple[StepEnd, Count, RESULTS, Memory]:
+) -> Solved:
+    """A step of length `h` of a scheme; with `skip` it costs no iteration."""
     problem = _problem(scheme, model, start, h, memory.carried)
     flight = _free_flight(scheme, problem, model, start)
     unknown_scale, row_scale = scales_like(flight, model, start, h)
@@ -194,7 +156,11 @@ def _attempt(
     z = jax.tree.map(jnp.multiply, root.value, unknown_scale)
     end = scheme.finish(z, problem)
     # What the scheme itself can tell of a failed iterate says more than that it failed.
-    result = first_failure(end.result, from_root_finder(root.found, root.broken))
+    result = from_root_finder(root.found, root.broken, root.residual)
+    turned = RESULTS.where(
+        _turns(model, start, end.state), RESULTS.step_too_large, RESULTS.successful
+    )
+    result = first_failure(first_failure(end.result, result), turned)
     added = jax.lax.stop_gradient(jax.tree.map(jnp.subtract, z, flight))
     off = lambda x: max_norm(
         jax.tree.map(lambda x, y, unit: (x - y) / unit, added, x, unknown_scale)
@@ -207,7 +173,22 @@ def _attempt(
         root.factors,
         end.carried,
     )
-    return end, root.iterations, result, memory
+    return Solved(end, root.iterations, root.residual, result, memory)
+
+
+def _turns(model: AbstractModel, a: State, b: State) -> Flag:
+    """Whether the gradient of a joint turns by more than a right angle from `a` to `b`.
+
+    A solution of the step equations on the other side of a joint satisfies the joint too.
+    """
+    if model.system.constraint is None:
+        return jnp.array(False)
+    rows = RowPattern(model.fixed, a.q)
+    unit = model.scales.coordinate[rows.columns]
+    before, after = (
+        rows.derivative(model.fixed, jax.lax.stop_gradient(q)) / unit for q in (a.q, b.q)
+    )
+    return jnp.any(jnp.sum(before * after, axis=1) < 0)
 
 
 def _with_multipliers(z: PyTree[Any], values: PyTree[Any]) -> PyTree[Any]:

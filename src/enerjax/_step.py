@@ -10,13 +10,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from ._check import prepare
+from ._check import check_halvings, prepare
+from ._divided import solve_or_divide
+from ._linear import largest
 from ._model import AbstractModel, make_model
 from ._newton import Newton
 from ._results import first_of, RESULTS
 from ._root import RootFinder
 from ._schemes import AbstractScheme
-from ._solve import first_memory, Memory, solve
+from ._solve import first_memory, Memory
 from ._system import AbstractSystem, State
 from ._types import Args, Coordinates, Count, Flag, Multipliers, Real, Scalar, Velocities
 
@@ -47,6 +49,8 @@ class StepOutput(eqx.Module):
       for a system that has none.
     - `details`: what the scheme reports of its own, or `None`.
     - `newton_iterations`: over all solves of the step.
+    - `residual`: of the step equations, see `Statistics`.
+    - `halvings`: how often the step, or a stage of it, was halved.
     - `result`: a `RESULTS`; compare it with `RESULTS.successful`.
     - `warm`: pass it to the next step.
     """
@@ -58,6 +62,8 @@ class StepOutput(eqx.Module):
     drive_work: Scalar | None
     details: PyTree[Any]
     newton_iterations: Count
+    residual: Scalar
+    halvings: Count
     result: RESULTS
     warm: Warm
 
@@ -89,24 +95,36 @@ def advance(
     warm: Warm,
     root_finder: RootFinder,
     skip: Flag,
+    max_halvings: int | None = None,
 ) -> StepOutput:
     """One step of a scheme, without checks. With `skip` it costs no iteration."""
 
     def stage(carry, stage_input):
         state, rest = carry
         length, memory = stage_input
-        end, iterations, result, memory = solve(
-            scheme.stage, model, state, length * h, memory, root_finder, skip
+        solved, halvings = solve_or_divide(
+            scheme.stage,
+            model,
+            state,
+            length * h,
+            memory,
+            root_finder,
+            skip,
+            max_halvings,
         )
+        end = solved.end
         energies = (end.dissipated, end.work, end.drive_work)
-        reported = (end.multipliers, energies, end.details, iterations, result)
+        costs = (solved.iterations, solved.residual, halvings)
+        reported = (end.multipliers, energies, end.details, costs, solved.result)
         q, rest = _sum_and_rest(state.q, end.displacement + rest)
-        return (State(q, end.state.v, end.state.t), rest), (length, reported, memory)
+        state = State(q, end.state.v, end.state.t)
+        return (state, rest), (length, reported, solved.memory)
 
     lengths = jnp.asarray(scheme.stages, h.dtype)
     begin, inputs = (start, warm.rest), (lengths, warm.stages)
     (state, rest), (lengths, reported, memory) = jax.lax.scan(stage, begin, inputs)
-    multipliers, energies, details, iterations, results = reported
+    multipliers, energies, details, costs, results = reported
+    iterations, residuals, halvings = costs
     dissipated, work, drive_work = jax.tree.map(jnp.sum, energies)
     return StepOutput(
         state,
@@ -117,6 +135,8 @@ def advance(
         drive_work,
         jax.tree.map(lambda x: x[-1], details),
         jnp.sum(iterations),
+        largest(residuals),
+        jnp.max(halvings),
         first_of(results),
         Warm(memory, rest),
     )
@@ -131,7 +151,7 @@ def _sum_and_rest(x: Array, y: Array) -> tuple[Array, Array]:
 
 
 @eqx.filter_jit
-def _single_step(system, scheme, state, args, h, warm, root_finder):
+def _single_step(system, scheme, state, args, h, warm, root_finder, max_halvings):
     model = make_model(system, state, args)
     state = model.enter(state)
     fresh = lambda: first_warm(scheme, model, state, h, *model.accelerations(state))
@@ -142,7 +162,8 @@ def _single_step(system, scheme, state, args, h, warm, root_finder):
             "`warm` is not of this scheme and system. Pass the `warm` of the step before, "
             "or none."
         )
-    out = advance(scheme, model, state, h, warm, root_finder, jnp.array(False))
+    no = jnp.array(False)
+    out = advance(scheme, model, state, h, warm, root_finder, no, max_halvings)
     return eqx.tree_at(lambda out: out.state, out, model.leave(out.state))
 
 
@@ -161,6 +182,7 @@ def step(
     t: Real = 0.0,
     warm: Warm | None = None,
     root_finder: RootFinder = Newton(),
+    max_halvings: int | None = None,
 ) -> StepOutput:
     """Advance one state by one step of length `h`, for loops of your own.
 
@@ -176,11 +198,12 @@ def step(
     - `t`: the time at which the step starts, for `force` and `driven`.
     - `warm`: `warm` of the step before, if it had the same `h`. Without it the
       accelerations and multipliers at `state` are computed to predict the step.
-    - `root_finder`: an optimistix root finder; see `simulate`.
+    - `root_finder`, `max_halvings`: see `simulate`.
 
     **Returns:** a `StepOutput`.
 
     **Raises:** `ValueError` or `TypeError` for wrong shapes, types and signs.
     """
     state, args, h, _ = prepare(system, scheme, state, args, h, t, root_finder)
-    return _single_step(system, scheme, state, args, h, warm, root_finder)
+    check_halvings(max_halvings)
+    return _single_step(system, scheme, state, args, h, warm, root_finder, max_halvings)

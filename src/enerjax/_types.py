@@ -15,6 +15,7 @@ Coordinates: TypeAlias = Float[Array, " nq"]
 Velocities: TypeAlias = Float[Array, " nv"]
 Multipliers: TypeAlias = Float[Array, " nc"]
 JointMultipliers: TypeAlias = Float[Array, " nj"]
+Times: TypeAlias = Float[Array, " times"]
 # What users may write for a number and for a vector.
 Real: TypeAlias = ScalarLike
 Vector: TypeAlias = ArrayLike | Sequence[ScalarLike]

@@ -3,14 +3,15 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 import scipy.linalg
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from .._check import check_system
 from .._linear import as_dense
-from .._model import AbstractModel, make_model
+from .._model import make_model
 from .._system import AbstractSystem, State
 from .._types import Args, Real
 
@@ -83,9 +84,7 @@ def freedoms(
 ) -> Mobility:
     """`mobility`, with rows that stand `first`, before those that may follow from them."""
     state, args = check_system(system, state, args, t)
-    model = make_model(system, state, args)
-    gradients, root = gradients_and_root(model, state)
-    scaled = unit_rows(gradients)
+    scaled, root, residual = scaled_constraints(system, state, args)
     num_constraints, num_coordinates = scaled.shape
     if names is None:
         names = [str(k) for k in range(num_constraints)]
@@ -102,7 +101,6 @@ def freedoms(
     rank = int(np.sum(values > _RANK))
     kept = independent_rows(scaled, first)
     # What no motion can repair: the part of the residual outside of the range.
-    residual = _residual(model, state, gradients, root)
     stuck = left[:, rank:] @ (left[:, rank:].T @ residual)
     return Mobility(
         num_coordinates - rank,
@@ -135,29 +133,31 @@ def independent_rows(scaled: np.ndarray, first: Sequence[int] = ()) -> list[int]
     return sorted(np.argsort(-own, kind="stable")[:rank].tolist())
 
 
-def unit_rows(gradients: np.ndarray) -> np.ndarray:
-    """Constraints in units of their own: rows of length one."""
-    lengths = np.linalg.norm(gradients, axis=1, keepdims=True)
-    return gradients / np.where(lengths > 0, lengths, 1.0)
+def scaled_constraints(
+    system: AbstractSystem, state: State, args: Args
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`dPhi/dq` in units of the constraints and the inertia, the root of the inertia, and
+    the residual in parts of the sizes of the constraints.
 
-
-def gradients_and_root(model: AbstractModel, state: State) -> tuple[np.ndarray, np.ndarray]:
-    """`dPhi/dq` in the metric of the inertia, and the lower triangular root of that."""
-    root = np.linalg.cholesky(np.asarray(as_dense(model.metric(model.enter(state)))))
-    jacobian = np.asarray(jax.jacfwd(model.constraint)(state.q, state.t))
-    return scipy.linalg.solve_triangular(root, jacobian.T, lower=True).T, root
-
-
-def _residual(
-    model: AbstractModel, state: State, gradients: np.ndarray, root: np.ndarray
-) -> np.ndarray:
-    """How far each constraint is violated, in parts of its size.
-
-    That is of its terms, or of its change where the whole pose is moved as far as it is
-    from the origin: terms can vanish, too.
+    Those are of their terms, and of the change that would come of moving the pose as far
+    as it is from the origin: the terms of a constraint can vanish.
     """
-    extent = np.linalg.norm(root.T @ np.asarray(state.q))
-    moved = extent * np.linalg.norm(gradients, axis=1)
-    size = np.asarray(model.scales.constraint_size) + moved
-    residual = np.asarray(model.constraint(state.q, state.t))
-    return residual / np.where(size > 0, size, 1.0)
+    metric, jacobian, residual, size = map(np.asarray, _linearised(system, state, args))
+    root = np.linalg.cholesky(metric)
+    scaled = scipy.linalg.solve_triangular(root, jacobian.T, lower=True).T
+    lengths = np.linalg.norm(scaled, axis=1)
+    unit = np.where(lengths > 0, lengths, 1.0)
+    size = size + lengths * np.linalg.norm(root.T @ np.asarray(state.q))
+    return scaled / unit[:, None], root, residual / np.where(size > 0, size, 1.0)
+
+
+@eqx.filter_jit
+def _linearised(
+    system: AbstractSystem, state: State, args: Args
+) -> tuple[Array, Array, Array, Array]:
+    """The inertia in the coordinates; the constraints: gradients, residuals, sizes."""
+    model = make_model(system, state, args)
+    metric = as_dense(model.metric(model.enter(state)))
+    jacobian = jax.jacfwd(model.constraint)(state.q, state.t)
+    residual = model.constraint(state.q, state.t)
+    return metric, jacobian, residual, model.scales.constraint_size

@@ -9,6 +9,7 @@ import operator
 import warnings
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,6 +56,7 @@ def prepare(
             f"The numbers of the scheme must be scalars, got {scheme}. To sweep them put "
             "the scheme inside `jax.vmap`."
         )
+    _check_number("h", h)
     if is_known(h) and np.ndim(h) == 0 and not 0 < float(np.real(h)) < np.inf:
         raise ValueError(f"`h` must be positive and finite, got {h}.")
     h = jnp.asarray(h, start.q.dtype)
@@ -74,6 +76,18 @@ def positive_integer(name: str, count: Any) -> int:
     if number < 1 or isinstance(count, bool):
         raise ValueError(f"`{name}` must be a positive integer, got {count!r}.")
     return number
+
+
+def check_halvings(max_halvings: int | None) -> None:
+    """Raises for what is no small number of halvings."""
+    if max_halvings is None:
+        return
+    whole = isinstance(max_halvings, int) and not isinstance(max_halvings, bool)
+    if not whole or not 0 <= max_halvings <= 20:
+        raise ValueError(
+            "`max_halvings` must be an integer from 0 to 20: a step that fails is tried "
+            f"again in up to `2 ** max_halvings` parts. Got {max_halvings!r}."
+        )
 
 
 def check_system(
@@ -99,7 +113,11 @@ def check_system(
         raise TypeError(f"`q` is {q.dtype} and `v` is {v.dtype}: give both one dtype.")
     if q.dtype == jnp.float32 and not jax.config.read("jax_enable_x64"):
         _warn_single_precision()
+    if q.dtype not in (jnp.float32, jnp.float64):
+        raise TypeError(f"`q` and `v` are {q.dtype}: give them as float64 or float32.")
     args = jax.tree.map(lambda x: _as_array(x, q.dtype), args)
+    _check_precision(args, q.dtype)
+    _check_number("t0` or `t", t)
     if jnp.ndim(t) != 0 or (is_known(t) and not np.isfinite(t)):
         raise ValueError(f"The time of the start must be a finite number, got {t}.")
     state = State(q, v, jnp.asarray(t, q.dtype) if system.is_timed else None)
@@ -117,6 +135,21 @@ def _warn_single_precision() -> None:
         '`jax.config.update("jax_enable_x64", True)` before the first array is made.',
         stacklevel=5,
     )
+
+
+def _check_number(name: str, x: Any) -> None:
+    if not isinstance(x, jax.Array) and np.asarray(x).dtype.kind not in "iuf":
+        raise TypeError(f"`{name}` must be a real number (time), got {x!r}.")
+
+
+def _check_precision(args: Args, dtype: Any) -> None:
+    """Arrays of another precision would lose digits, or feign them, step by step."""
+    for path, x in jax.tree_util.tree_leaves_with_path(args):
+        if eqx.is_inexact_array(x) and not jnp.iscomplexobj(x) and x.dtype != dtype:
+            raise TypeError(
+                f"`args{jax.tree_util.keystr(path)}` is {x.dtype} and the start is {dtype}"
+                ": give both one dtype. (Python floats take that of the start.)"
+            )
 
 
 def _as_array(x: Any, dtype: Any) -> Any:

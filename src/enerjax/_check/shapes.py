@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from .._kinematics import ConfigurationKinematics
@@ -26,6 +27,7 @@ _SIGNATURES = dict(
     coordinate_constraint="`(q, args)`",
     force="`(q, v, t, args)`",
     driven="`(q, t, args)`",
+    symmetry="`(q, args)`",
     kinematics="`(q, args)`",
 )
 
@@ -46,7 +48,7 @@ def _shape(role: str, fn: Callable, *inputs: Any) -> tuple[int, ...]:
         ) from None
     except ValueError:  # no signature to be had
         pass
-    out = eqx.filter_eval_shape(fn, *inputs)
+    out = _traced(role, fn, *inputs)
     if not hasattr(out, "shape") or not jnp.issubdtype(out.dtype, jnp.floating):
         kind = out.dtype if hasattr(out, "dtype") else f"a Python {type(out).__name__}"
         raise TypeError(
@@ -54,6 +56,32 @@ def _shape(role: str, fn: Callable, *inputs: Any) -> tuple[int, ...]:
             "with `jax.numpy` from its arguments: `0.0 * q[0]` is a zero of the right kind."
         )
     return out.shape
+
+
+def _traced(role: str, fn: Callable, *inputs: Any) -> Any:
+    """The kind of value that a function returns, and in its name what it raises."""
+    try:
+        return eqx.filter_eval_shape(fn, *inputs)
+    except (
+        jax.errors.ConcretizationTypeError,
+        jax.errors.TracerArrayConversionError,
+        jax.errors.TracerIntegerConversionError,
+    ) as error:
+        raise TypeError(
+            f"{describe(role, fn)} asks for the value of a number that is traced. Write it "
+            "with `jax.numpy`, not `math` or `numpy`, and `jnp.where` instead of `if`."
+        ) from error
+    except Exception as error:
+        raise ValueError(
+            f"{describe(role, fn)} raised {type(error).__name__}: {error}. It is called "
+            f"with {_SIGNATURES[role]}, and `args` is {_kind(inputs[-1])} here."
+        ) from error
+
+
+def _kind(args: Any) -> str:
+    if isinstance(args, dict):
+        return f"a dictionary with the keys {sorted(map(str, args))}"
+    return "None" if args is None else f"of type {type(args).__name__}"
 
 
 def check_shapes(system: AbstractSystem, state: State, args: Args) -> None:
@@ -64,9 +92,16 @@ def check_shapes(system: AbstractSystem, state: State, args: Args) -> None:
                 f"{describe(role, fn)} must return a scalar, an energy, got shape {shape}."
                 + (" Sum over the bodies, or index the entry." if shape else "")
             )
-    _rows("constraint", system.constraint, state.q, args)
-    _rows("driven", system.driven, state.q, state.t, args)
+    rows = _rows("constraint", system.constraint, state.q, args)
+    rows += _rows("driven", system.driven, state.q, state.t, args)
+    if rows > state.q.size and not system.redundant:
+        raise ValueError(
+            f"{rows} constraints of {state.q.size} coordinates cannot be independent. "
+            "Leave out those that follow from the others, or declare "
+            "`System(..., redundant=True)`."
+        )
     _check_force(system, state, args)
+    _check_symmetry(system, state, args)
     if isinstance(system, System):
         _check_separable(system, state, args)
     elif state.q.size != state.v.size:
@@ -103,6 +138,18 @@ def _check_force(system: AbstractSystem, state: State, args: Args) -> None:
             f"{describe('force', system.force)} returned shape {shape}, but `v` has "
             f"{state.v.size} entries: give one for each, conjugate to it (its power is "
             "`force . v`). A force on a point enters with the Jacobian of the point."
+        )
+
+
+def _check_symmetry(system: AbstractSystem, state: State, args: Args) -> None:
+    if system.symmetry is None:
+        return
+    shape = _shape("symmetry", system.symmetry, state.q, args)
+    if len(shape) != 2 or shape[1] != state.v.size:
+        raise ValueError(
+            f"{describe('symmetry', system.symmetry)} returned shape {shape}: give one row "
+            f"of {state.v.size} velocities for each symmetry. A single one is "
+            "`velocities[None]`."
         )
 
 

@@ -31,6 +31,12 @@ def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]
     constraints = [system.constraint]
     if isinstance(system, System):
         constraints.append(system.coordinate_constraint)
+    potential = lambda q: system.potential_energy(State(q, jnp.zeros_like(state.v)), args)
+    held = [lambda q, fn=fn: fn(q, args) for fn in constraints if fn is not None]
+    # Along a direction without symmetry, in which a row changes if it depends on `q`.
+    along = 1 + 0.5 * jnp.cos(jnp.arange(state.q.size, dtype=state.q.dtype))
+    rates = [jax.jvp(fn, (state.q,), (along,))[1] for fn in held]
+    slopes = jnp.concatenate([jnp.zeros((0,), state.q.dtype), *rates])
     timed, t = [], state.t
     if system.force is not None and t is not None:
         timed.append(system.force(state.q, state.v, t, args))
@@ -42,6 +48,9 @@ def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]
         potential=finite(system.potential_energy(state, args)),
         timed=finite(timed),
         constraint=finite([f(state.q, args) for f in constraints if f is not None]),
+        slope=finite(jax.grad(potential)(state.q)),
+        slopes=finite(slopes),
+        depends=jnp.array(system.redundant) | jnp.all(slopes != 0),
         inertia=finite(inertia),
         quadratic=_is_quadratic(system, state, inertia, args),
         symmetric=jnp.all(jnp.abs(scaled - jnp.swapaxes(scaled, 1, 2)) <= eps),
@@ -95,7 +104,23 @@ def check_values(system: AbstractSystem, state: State, args: Args) -> None:
             f"`force` or `driven` is not finite at the start, t = {state.t}. Is it defined "
             "there?",
         ),
+        (
+            "slope",
+            f"The slope of {potential} is not finite at the start, q = {state.q}. It must "
+            "be differentiable there: the norm of a vector that vanishes is not, nor the "
+            "root of zero.",
+        ),
         ("constraint", "The constraints are not finite at the start. Defined there?"),
+        (
+            "slopes",
+            f"The slope of a constraint is not finite at the start, q = {state.q}. Write "
+            "lengths as squares: `d @ d - l**2`.",
+        ),
+        (
+            "depends",
+            "A row of the constraints does not depend on `q` at the start: is it constant, "
+            "or the square of what vanishes?",
+        ),
         (
             "inertia",
             f"The {inertia} is not finite. {missing}"

@@ -28,11 +28,14 @@ class AbstractDerivative(eqx.Module):
         b: Coordinates,
         *,
         weights: Coordinates | float = 1.0,
+        size: Scalar | float = 0.0,
     ) -> Coordinates:
         """The discrete gradient of the scalar function `fn` between `a` and `b`.
 
         `weights` are what squares of the increments are weighted with in the norm of a
-        correction: they matter where the entries have different units.
+        correction: they matter where the entries have different units. `size` tells how
+        large the terms of `fn` are, where they may cancel: a correction below their
+        round-off is none.
         """
 
 

@@ -133,6 +133,7 @@ class ChainRule(AbstractDerivative):
         b: Coordinates,
         *,
         weights: Coordinates | float = 1.0,
+        size: Scalar | float = 0.0,
     ) -> Coordinates:
-        del weights  # no correction
+        del weights, size  # no correction
         return discrete_grad(fn)(a, b)

@@ -13,8 +13,9 @@ of `fn` itself,
 
     |D . d - (fn(b) - fn(a))| <= eps (|fn(a)| + |fn(b)| + sum_k |g_k| (|a_k| + |b_k|)),
 
-and the value and all its derivatives stay finite down to `b = a`. For functions that are
-at most quadratic the bracket is nothing but round-off at any `d`.
+(or by that of its terms, where their size is given: they can cancel), and the value and
+all its derivatives stay finite down to `b = a`. For functions that are at most quadratic
+the bracket is nothing but round-off at any `d`.
 """
 
 import abc
@@ -37,12 +38,13 @@ def _closed(
     b: Coordinates,
     mean: Coordinates,
     weights: Coordinates | float,
+    size: Scalar | float,
 ) -> Coordinates:
     d = b - a
     along = weights * d
     defect = fn_b - fn_a - mean @ d
-    size = abs(fn_a) + abs(fn_b) + abs(mean) @ (abs(a) + abs(b))
-    defect = significant(defect, size)
+    own = abs(fn_a) + abs(fn_b) + abs(mean) @ (abs(a) + abs(b))
+    defect = significant(defect, size + own)
     # Both operands of the quotient are guarded: under autodiff the branch that `where`
     # does not take is multiplied by zero, and must be finite for that.
     length2 = jnp.where(defect != 0, d @ along, 1.0)
@@ -75,8 +77,10 @@ class AbstractCorrected(AbstractDerivative):
         b: Coordinates,
         *,
         weights: Coordinates | float = 1.0,
+        size: Scalar | float = 0.0,
     ) -> Coordinates:
-        return _closed(fn(a), fn(b), a, b, self._mean(jax.grad(fn), a, b), weights)
+        mean = self._mean(jax.grad(fn), a, b)
+        return _closed(fn(a), fn(b), a, b, mean, weights, size)
 
     def gradients_of_rows(
         self,
@@ -92,7 +96,7 @@ class AbstractCorrected(AbstractDerivative):
         them. Corrections by rows couple no coordinates that the function does not.
         """
         mean = self._mean(gradients, a, b)
-        close = jax.vmap(lambda *ends: _closed(*ends, weights=1.0))
+        close = jax.vmap(lambda *ends: _closed(*ends, weights=1.0, size=0.0))
         return close(fn(a), fn(b), own(a), own(b), mean)
 
 

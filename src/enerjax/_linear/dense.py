@@ -6,7 +6,7 @@ from compiling the loop around it into a single function.
 
 import abc
 import functools
-from typing import Any, Self
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -82,7 +82,7 @@ class AbstractFactors(eqx.Module):
     """What is kept of a matrix to solve with it, and to begin the next one with."""
 
     @abc.abstractmethod
-    def renewed(self, matrix: Float[Array, "n n"]) -> Self:
+    def renewed(self, matrix: Float[Array, "n n"]) -> "AbstractFactors":
         """Of another matrix; one that differs little can cost less."""
 
     @abc.abstractmethod

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from .._model import make_model
 from .._results import RESULTS
+from .._run import simulate
 from .._schemes import AbstractScheme, Composed, EnergyPreserving
-from .._simulate import simulate
 from .._solution import Solution
 from .._system import AbstractSystem, State
 from .._types import Args, Scalar

@@ -4,6 +4,7 @@ from .base import AbstractModel as AbstractModel
 from .canonical import CanonicalModel as CanonicalModel
 from .interval import Drive as Drive, Increment as Increment, Time as Time
 from .separable import SeparableModel as SeparableModel
+from .sizes import force_size as force_size
 
 
 def make_model(system: AbstractSystem, state: State, args: Args) -> AbstractModel:

@@ -75,6 +75,10 @@ class AbstractModel(eqx.Module):
     def potential(self, state: State) -> Scalar: ...
 
     @abc.abstractmethod
+    def momentum(self, state: State) -> Velocities:
+        """The momenta conjugate to the velocities."""
+
+    @abc.abstractmethod
     def gradient(self, state: State, h: Scalar) -> Drive:
         """`h dH/dq` and `dH/dmu` in one state, without multipliers."""
 
@@ -170,6 +174,12 @@ class AbstractModel(eqx.Module):
     def joint_rate(self, q: Coordinates, v: Velocities, t: Time) -> JointMultipliers:
         """`psi(q, v, t) = dPhi/dt` of the joints."""
         return jax.jvp(self.joint, (q, t), (self.lift(q, v), lapse_of(t)))[1]
+
+    def symmetry_momenta(self, state: State) -> Float[Array, " ns"]:
+        """The momenta of the symmetries that the user has named."""
+        if self.system.symmetry is None:
+            return jnp.zeros((0,), state.q.dtype)
+        return self.system.symmetry(state.q, self.args) @ self.momentum(state)
 
     def split(self, increment: Increment) -> tuple[Increment, Increment]:
         """The multipliers of what does not depend on time, and those of what does."""

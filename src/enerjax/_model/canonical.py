@@ -18,6 +18,7 @@ from .._types import (
 from .base import AbstractModel
 from .interval import Drive, Increment, lapse_of, Scales, Time
 from .lapse import gradient_and_work
+from .sizes import action_size
 
 
 class CanonicalModel(AbstractModel):
@@ -60,6 +61,9 @@ class CanonicalModel(AbstractModel):
 
     def lift(self, q: Coordinates, v: Velocities) -> Coordinates:
         return self.system.hamiltonian_and_rate(q, v, self.args)[1]
+
+    def momentum(self, state: State) -> Velocities:
+        return state.v
 
     def gradient(self, state: State, h: Scalar) -> Drive:
         force, rate = jax.grad(self.hamiltonian, argnums=(0, 1))(state.q, state.v)
@@ -110,6 +114,7 @@ class CanonicalModel(AbstractModel):
         middle = 0.5 * (a.q + b.q), 0.5 * (a.v + b.v)
         masses = self.system.masses(*middle, self.args)
         weights = jnp.concatenate([masses, h**2 / masses])
+        size = action_size(self, derivative, a, h, increment)
         both, work = gradient_and_work(
             derivative,
             action,
@@ -117,6 +122,7 @@ class CanonicalModel(AbstractModel):
             (jnp.concatenate([a.q, a.v]), a.t),
             (jnp.concatenate([b.q, b.v]), b.t),
             weights,
+            size,
         )
         return Drive(both[:size], both[size:] / h, work)
 

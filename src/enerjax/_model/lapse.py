@@ -1,5 +1,6 @@
 """Discrete gradients over an interval in which time may pass."""
 
+import functools
 from collections.abc import Callable
 
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ def gradient_and_work(
     a: tuple[Coordinates, Time],
     b: tuple[Coordinates, Time],
     weights: Coordinates | float = 1.0,
+    size: Scalar | float = 0.0,
 ) -> tuple[Coordinates, Scalar | None]:
     """The discrete gradient of `still(x) + moved(x, t)`, and its part in `t`.
 
@@ -28,14 +30,15 @@ def gradient_and_work(
     depend on time stays apart, lest its own defect be counted as work of the drive.
     """
     (xa, ta), (xb, tb) = a, b
+    gradient = functools.partial(derivative.gradient, weights=weights, size=size)
     if moved is None:
-        return derivative.gradient(still, xa, xb, weights=weights), None
+        return gradient(still, xa, xb), None
     # The nodes of a jump share the time itself: none passes.
     if ta is tb:
         both = lambda x: still(x) + moved(x, ta)
-        return derivative.gradient(both, xa, xb, weights=weights), None
+        return gradient(both, xa, xb), None
     with_time, work = over_time(derivative, moved, a, b)
-    return derivative.gradient(still, xa, xb, weights=weights) + with_time, work
+    return gradient(still, xa, xb) + with_time, work
 
 
 def over_time(

@@ -44,6 +44,7 @@ from .elements import (
 )
 from .interval import Drive, Increment, Scales, Time
 from .lapse import gradient_and_work
+from .sizes import action_size
 
 
 class SeparableModel(AbstractModel):
@@ -90,6 +91,9 @@ class SeparableModel(AbstractModel):
 
     def _potential(self, q: Coordinates) -> Scalar:
         return self.system.potential(q, self.args)
+
+    def momentum(self, state: State) -> Velocities:
+        return self.inertia @ state.v
 
     def gradient(self, state: State, h: Scalar) -> Drive:
         return Drive(h * jax.grad(self._potential)(state.q), jnp.zeros((0,), h.dtype))
@@ -153,7 +157,10 @@ class SeparableModel(AbstractModel):
         ends, none = ((a.q, a.t), (b.q, b.t)), jnp.zeros((0,), h.dtype)
         energies = self._element_energies(a.q)
         if energies is None or not isinstance(derivative, AbstractCorrected):
-            impulse, work = gradient_and_work(derivative, action, with_time, *ends)
+            size = action_size(self, derivative, a, h, increment)
+            impulse, work = gradient_and_work(
+                derivative, action, with_time, *ends, size=size
+            )
             return Drive(impulse, none, work)
         rows: list[Summands] = [lambda q, fn=fn: h * fn(q) for fn in energies]
         rows += [lambda q: fixed.impulse * held(q)]

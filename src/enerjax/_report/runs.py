@@ -10,6 +10,7 @@ import numpy as np
 
 from .. import problems
 from .._results import RESULTS
+from .._run import simulate
 from .._schemes import (
     AbstractScheme,
     Composed,
@@ -18,7 +19,6 @@ from .._schemes import (
     EnergyPreserving,
     KappaDecaying,
 )
-from .._simulate import simulate
 from .._solution import Solution
 
 

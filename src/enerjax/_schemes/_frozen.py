@@ -20,12 +20,12 @@ class Frozen(eqx.Module):
     # and the inertia there.
     stiffness: Float[Array, "nq nq"] | Assembled
     inertia: Symmetric
-    compliance: Float[Array, "nq nq"]
+    compliance: Float[Array, "np np"]
     # X = (M + lag^2 K+)^-1 (h/6) K+ with lag = alpha h/6: j_v = X (dq + lag dv). Empty
     # where the stiffness is assembled: X would be full, so j_v is an unknown there.
-    jump: Float[Array, "nq nq"]
+    jump: Float[Array, "nx nx"]
     # (1 + lag X)^-1, where velocities are eliminated.
-    damping: Float[Array, "nq nq"]
+    damping: Float[Array, "nd nd"]
 
 
 def freeze(step: StepProblem, alpha: Scalar) -> Frozen:

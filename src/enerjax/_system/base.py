@@ -40,13 +40,21 @@ from .._types import (
 
 
 def inexact(x: Any) -> Array:
-    x = jnp.asarray(x)
+    try:
+        x = jnp.asarray(x)
+    except (TypeError, ValueError, DeprecationWarning):
+        raise TypeError(
+            "Coordinates, velocities and inertia must be arrays or lists of numbers, got "
+            f"{x!r}."
+        ) from None
     return x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(float)
 
 
 # `force(q, v, t, args)` and `driven(q, t, args)`.
 Force: TypeAlias = Callable[[Coordinates, Velocities, Scalar, Args], Velocities]
 Driven: TypeAlias = Callable[[Coordinates, Scalar, Args], JointMultipliers]
+# `symmetry(q, args)`.
+Symmetry: TypeAlias = Callable[[Coordinates, Args], Float[Array, "ns nv"]]
 
 
 class State(eqx.Module):
@@ -71,6 +79,7 @@ class AbstractSystem(eqx.Module):
     constraint: eqx.AbstractVar[Callable[[Coordinates, Args], Multipliers] | None]
     force: eqx.AbstractVar[Force | None]
     driven: eqx.AbstractVar[Driven | None]
+    symmetry: eqx.AbstractVar[Symmetry | None]
     redundant: eqx.AbstractVar[bool]
 
     @property

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Args, Coordinates, Multipliers, Scalar, Velocities
-from .base import AbstractSystem, check_function, Driven, Force, State
+from .base import AbstractSystem, check_function, Driven, Force, State, Symmetry
 
 
 class AbstractCanonicalSystem(AbstractSystem):
@@ -42,6 +42,7 @@ class LagrangianSystem(AbstractCanonicalSystem):
     constraint: Callable[[Coordinates, Args], Multipliers] | None = None
     force: Force | None = None
     driven: Driven | None = None
+    symmetry: Symmetry | None = None
     redundant: bool = eqx.field(default=False, static=True)
 
     def __check_init__(self):
@@ -50,6 +51,7 @@ class LagrangianSystem(AbstractCanonicalSystem):
         check_function("constraint", "(q, args)", self.constraint, optional=True)
         check_function("force", "(q, qdot, t, args)", self.force, optional=True)
         check_function("driven", "(q, t, args)", self.driven, optional=True)
+        check_function("symmetry", "(q, args)", self.symmetry, optional=True)
 
     def kinetic_energy(self, state: State, args: Args = None) -> Scalar:
         return self.kinetic(state.q, state.v, args)
@@ -85,6 +87,7 @@ class HamiltonianSystem(AbstractCanonicalSystem):
     constraint: Callable[[Coordinates, Args], Multipliers] | None = None
     force: Force | None = None
     driven: Driven | None = None
+    symmetry: Symmetry | None = None
     redundant: bool = eqx.field(default=False, static=True)
 
     def __check_init__(self):
@@ -92,6 +95,7 @@ class HamiltonianSystem(AbstractCanonicalSystem):
         check_function("constraint", "(q, args)", self.constraint, optional=True)
         check_function("force", "(q, qdot, t, args)", self.force, optional=True)
         check_function("driven", "(q, t, args)", self.driven, optional=True)
+        check_function("symmetry", "(q, args)", self.symmetry, optional=True)
 
     def kinetic_energy(self, state: State, args: Args = None) -> Scalar:
         """`H(q, p) - H(q, 0)`"""

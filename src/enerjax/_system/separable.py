@@ -12,7 +12,15 @@ from .._kinematics import (
 )
 from .._linear import BlockDiagonal, hessian, in_blocks, Symmetric
 from .._types import Args, Coordinates, Multipliers, Scalar, Velocities
-from .base import AbstractSystem, check_function, Driven, Force, inexact, State
+from .base import (
+    AbstractSystem,
+    check_function,
+    Driven,
+    Force,
+    inexact,
+    State,
+    Symmetry,
+)
 from .canonical import HamiltonianSystem, LagrangianSystem
 
 
@@ -40,6 +48,10 @@ class System(AbstractSystem):
     - `driven`: `driven(q, t, args)`, a vector that vanishes in every admissible
       configuration at time `t`: a pivot that is moved, a prescribed angle. Held as
       `constraint` is, and twice differentiable in `t`.
+    - `symmetry`: `symmetry(q, args)`, shape `(ns, nv)`: in each row the velocities of a
+      motion that is expected to change no energy and no constraint, such as a common
+      translation or rotation. It changes nothing but the audit, which then follows the
+      momenta that belong to them.
     - `redundant`: whether constraints may repeat each other, as those of over-constrained
       mechanisms do. Multipliers are then of least norm (each in the measure of its
       constraint), to the order of the scheme; the motion does not depend on it.
@@ -58,6 +70,7 @@ class System(AbstractSystem):
     coordinate_constraint: Callable[[Coordinates, Args], Multipliers] | None
     force: Force | None
     driven: Driven | None
+    symmetry: Symmetry | None
     redundant: bool = eqx.field(static=True)
 
     def __init__(
@@ -70,6 +83,7 @@ class System(AbstractSystem):
         coordinate_constraint: Callable[[Coordinates, Args], Multipliers] | None = None,
         force: Force | None = None,
         driven: Driven | None = None,
+        symmetry: Symmetry | None = None,
         redundant: bool = False,
     ):
         check_function("potential", "(q, args)", potential)
@@ -81,6 +95,7 @@ class System(AbstractSystem):
             check_function(name, "(q, args)", value, optional=True)
         check_function("force", "(q, v, t, args)", force, optional=True)
         check_function("driven", "(q, t, args)", driven, optional=True)
+        check_function("symmetry", "(q, args)", symmetry, optional=True)
         if coordinate_constraint is not None and kinematics is None:
             raise ValueError(
                 "`System(coordinate_constraint=...)` without `kinematics`: where the "
@@ -89,6 +104,11 @@ class System(AbstractSystem):
                 "give `kinematics`."
             )
         if not (callable(kinetic) or isinstance(kinetic, BlockDiagonal)):
+            if kinetic is None or isinstance(kinetic, str) or jnp.iscomplexobj(kinetic):
+                raise TypeError(
+                    "`kinetic` must be a function of (v, args) or the real inertia matrix, "
+                    f"got {kinetic!r}."
+                )
             kinetic = in_blocks(inexact(kinetic))
         self.kinetic = kinetic
         self.potential = potential
@@ -96,6 +116,7 @@ class System(AbstractSystem):
         self.coordinate_constraint = coordinate_constraint
         self.force = force
         self.driven = driven
+        self.symmetry = symmetry
         self.redundant = redundant
         self.kinematics = (
             IdentityKinematics()
@@ -132,6 +153,7 @@ class System(AbstractSystem):
         *,
         force: Force | None = None,
         driven: Driven | None = None,
+        symmetry: Symmetry | None = None,
         redundant: bool = False,
     ) -> LagrangianSystem:
         """A system whose inertia depends on its coordinates.
@@ -150,7 +172,7 @@ class System(AbstractSystem):
         - `constraint`: `constraint(q, args)`, a vector that vanishes in every admissible
           configuration. Leave it out if there is none.
         - `force`: `force(q, qdot, t, args)`, shape `(nq,)`, conjugate to `qdot`.
-        - `driven`: `driven(q, t, args)`; `redundant`: see `System`.
+        - `driven`: `driven(q, t, args)`; `symmetry`, `redundant`: see `System`.
 
         **Returns:** what all functions take for a `System`; the `v` of a `State` is
         `qdot`, shape `(nq,)`.
@@ -161,6 +183,7 @@ class System(AbstractSystem):
             constraint=constraint,
             force=force,
             driven=driven,
+            symmetry=symmetry,
             redundant=redundant,
         )
 
@@ -171,6 +194,7 @@ class System(AbstractSystem):
         *,
         force: Force | None = None,
         driven: Driven | None = None,
+        symmetry: Symmetry | None = None,
         redundant: bool = False,
     ) -> HamiltonianSystem:
         """A system given by its Hamiltonian.
@@ -187,7 +211,8 @@ class System(AbstractSystem):
         - `constraint`: as for `from_lagrangian`. It is held in `q`, and
           `B(q) dH/dp = 0` in `p`.
         - `force`: `force(q, qdot, t, args)`, shape `(nq,)`, conjugate to `qdot = dH/dp`.
-        - `driven`: `driven(q, t, args)`; `redundant`: see `System`.
+        - `driven`: `driven(q, t, args)`; `symmetry` (rows of `qdot`), `redundant`: see
+          `System`.
 
         **Returns:** what all functions take for a `System`; the `v` of a `State` is the
         momentum `p`, shape `(nq,)`. The audit counts `H(q, 0)` as potential energy.
@@ -197,5 +222,6 @@ class System(AbstractSystem):
             constraint=constraint,
             force=force,
             driven=driven,
+            symmetry=symmetry,
             redundant=redundant,
         )

@@ -15,7 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from ._root import ROOT
+from .._lanes import anywhere
+from .._root import ROOT
 
 
 # Steps beyond which the roots are not kept.
@@ -44,12 +45,21 @@ def scans(rows: int, steps: int) -> tuple[Scan, Scan]:
     return functools.partial(_in_segments, keep, segment // steps), jax.lax.scan
 
 
+def scan_until(done: Callable[[Any], Array], length: int) -> Scan:
+    """A loop of at most `length` steps, over once `done(carry)`: what is left of its
+    segments costs nothing then, and what it hands out there is zero. In a batch the last
+    lane decides."""
+    keep = keep_roots if length <= LONG else _checkpoint
+    return functools.partial(_in_segments, keep, math.isqrt(length), done=done)
+
+
 def _in_segments(
     keep: Callable[[Body], Body],
     about: int,
     body: Body,
     carry: Any,
     live: Bool[Array, " length"],
+    done: Callable[[Any], Array] | None = None,
 ) -> tuple[Any, Any]:
     """A scan over `live`, whose segments are checkpointed.
 
@@ -59,6 +69,19 @@ def _in_segments(
     size = min(range((about + 1) // 2, 2 * about + 1), key=lambda size: -length % size)
     live = jnp.append(live, jnp.zeros((-length % size,), bool)).reshape(-1, size)
     segment = keep(lambda carry, live: jax.lax.scan(body, carry, live))
+    if done is not None:
+        segment = _unless(done, segment)
     carry, out = jax.lax.scan(segment, carry, live)
     join = lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:])[:length]
     return carry, jax.tree.map(join, out)
+
+
+def _unless(done: Callable[[Any], Array], segment: Body) -> Body:
+    """`segment`, passed over where it would change nothing."""
+
+    def idle(carry: Any, live: Array) -> tuple[Any, Any]:
+        _, out = jax.eval_shape(segment, carry, live)
+        return carry, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), out)
+
+    skip = lambda carry: ~anywhere(~done(carry))
+    return lambda carry, live: jax.lax.cond(skip(carry), idle, segment, carry, live)

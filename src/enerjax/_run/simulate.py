@@ -1,21 +1,26 @@
+from typing import Literal
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ._audit import audit
-from ._check import positive_integer, prepare
-from ._model import AbstractModel, make_model
-from ._newton import Newton
-from ._results import first_failure, RESULTS
-from ._reverse import keep_roots, scans
-from ._root import RootFinder
-from ._schemes import AbstractScheme
-from ._solution import Solution, Statistics
-from ._step import advance, first_warm, Warm
-from ._system import AbstractSystem, State
-from ._tracing import is_known
-from ._types import Args, Count, Flag, Real, Scalar
+from .._audit import audit
+from .._check import check_form, check_halvings, positive_integer, prepare
+from .._model import make_model
+from .._newton import Newton
+from .._results import first_failure, RESULTS
+from .._root import RootFinder
+from .._schemes import AbstractScheme
+from .._solution import Solution, Statistics
+from .._step import advance, first_warm, Warm
+from .._system import AbstractSystem, State
+from .._types import Args, Count, Flag, Real, Vector
+from .controller import StepController
+from .failure import raise_failure
+from .reverse import keep_roots, scans
+from .selection import check_start, nan_unless, select
+from .to_time import simulate_until
 
 
 class _Carry(eqx.Module):
@@ -34,13 +39,18 @@ def simulate(
     args: Args = None,
     *,
     h: Real,
-    num_steps: int,
+    num_steps: int | None = None,
+    t1: Real | None = None,
+    ts: Vector | Literal["steps"] | None = None,
+    max_steps: int | None = None,
+    controller: StepController | None = None,
     t0: Real = 0.0,
     save_every: int = 1,
     root_finder: RootFinder = Newton(),
+    max_halvings: int | None = None,
     throw: bool = True,
 ) -> Solution:
-    """Integrate `num_steps` steps of length `h` from `start`.
+    """Integrate `num_steps` steps of length `h` from `start`, or until the time `t1`.
 
     `h`, the numbers of the scheme (`alpha`), `start` and all inexact leaves of `args` are
     traced: new values never recompile, and `vmap`, `grad`, `jvp` and `jit` work over each.
@@ -59,9 +69,27 @@ def simulate(
       quotient must be whole. In reverse mode the solved unknowns of each step are stored
       too, up to 10^4 steps; beyond, memory grows like the square root of the steps, at
       the cost of one more run.
+    - `t1`: instead of these, the time of the end, traced. The number of steps is
+      `(t1 - t0)/h`, rounded up but for round-off, and `h` is shortened to fit: lanes of
+      different `h` end at the same time, in one program.
+    - `ts`: with `t1`, the times of the rows, `(times,)`, ascending; or `"steps"`: the start
+      and the end of every step, `max_steps + 1` rows, NaN after the last; without it `t0`
+      and `t1`. Within a step the state is interpolated to the order of the scheme and moved
+      onto the constraints; at its end it is the state itself. With `ts` memory grows with
+      `max_steps`.
+    - `max_steps`: with `t1`, a bound on the steps, rejected ones included; a run that
+      needs more fails. Without it the number of steps where it is known, and with a
+      controller 4096. Steps that are left cost nothing; of a batch those after its last
+      lane.
+    - `controller`: with `t1`, a `StepController` that varies the steps; `h` is the first.
+      Derivatives are those of the steps as they were chosen, as parts of `t1 - t0`.
     - `t0`: the time of the start; step `k` begins at `t0 + k h`. Traced.
     - `root_finder`: for the step equations, which are scaled to order one (so tolerances
       are relative); one of optimistix can be given.
+    - `max_halvings`: a step that fails is tried again in 2, 4, up to `2 ** max_halvings`
+      equal parts, in which the laws of the energy hold as in a whole one; 0 for never.
+      Where it is not given: 3 for systems of many unknowns, else 0, for it makes the
+      program longer. `stats.halvings` tells where it was needed.
     - `throw`: raise an error at the end of a run that failed, which names the step, the
       time and the cause (under `jit`, `vmap` and `grad` the cause alone, and for all
       lanes together). With `False` look at `result`: rows after the failure are NaN.
@@ -71,6 +99,23 @@ def simulate(
     **Raises:** `ValueError` or `TypeError` for bad input, before any step;
     `equinox.EquinoxRuntimeError` for a failed run if `throw`.
     """
+    check_form(num_steps, save_every, t1, ts, max_steps, controller)
+    check_halvings(max_halvings)
+    if num_steps is None:
+        times = t0, t1, ts
+        return simulate_until(
+            system,
+            scheme,
+            start,
+            args,
+            h,
+            times,
+            max_steps,
+            controller,
+            root_finder,
+            max_halvings,
+            throw,
+        )
     num_steps = positive_integer("num_steps", num_steps)
     save_every = positive_integer("save_every", save_every)
     if num_steps % save_every != 0:
@@ -78,12 +123,37 @@ def simulate(
             f"`num_steps` ({num_steps}) must be a multiple of `save_every` ({save_every})."
         )
     start, args, h, t0 = prepare(system, scheme, start, args, h, t0, root_finder)
-    solution = _run(system, scheme, start, args, h, t0, root_finder, num_steps, save_every)
-    return _raise_failure(solution, h, t0) if throw else solution
+    solution = _run(
+        system,
+        scheme,
+        start,
+        args,
+        h,
+        t0,
+        root_finder,
+        max_halvings,
+        num_steps,
+        save_every,
+    )
+    if not throw:
+        return solution
+    reached = t0 + h * solution.stats.completed_steps.astype(h.dtype)
+    return raise_failure(solution, system, args, reached, h)
 
 
 @eqx.filter_jit
-def _run(system, scheme, start, args, h, t0, root_finder, num_steps, save_every):
+def _run(
+    system,
+    scheme,
+    start,
+    args,
+    h,
+    t0,
+    root_finder,
+    max_halvings,
+    num_steps,
+    save_every,
+):
     model = make_model(system, start, args)
     start = model.enter(start)
     acceleration, multipliers0 = model.accelerations(start)
@@ -96,36 +166,39 @@ def _run(system, scheme, start, args, h, t0, root_finder, num_steps, save_every)
     def one_step(carry: _Carry, live: Flag):
         skip = (carry.result != RESULTS.successful) | ~live
         begin = timed(carry.state, carry.completed.astype(h.dtype))
-        out = advance(scheme, model, begin, h, carry.warm, root_finder, skip)
+        out = advance(scheme, model, begin, h, carry.warm, root_finder, skip, max_halvings)
         result = first_failure(carry.result, out.result)
         result = RESULTS.where(live, result, carry.result)
         good = live & (result == RESULTS.successful)
         reached = State(out.state.q, out.state.v)
-        state, memory = _select(good, (reached, out.warm), (carry.state, carry.warm))
+        state, memory = select(good, (reached, out.warm), (carry.state, carry.warm))
         completed = carry.completed + good.astype(carry.completed.dtype)
         reported = (out.multipliers, out.details)
         energies = (out.dissipated, out.work, out.drive_work)
         return _Carry(state, memory, result, completed), (
             reported,
             jax.tree.map(lambda x: jnp.where(good, x, 0), energies),
-            jnp.where(skip, 0, out.newton_iterations),
+            jax.tree.map(
+                lambda x: jnp.where(skip, 0, x),
+                (out.newton_iterations, out.residual, out.halvings),
+            ),
         )
 
     num_saves = num_steps // save_every
     scan_of_rows, scan_of_steps = scans(num_saves, save_every)
 
     def one_save(carry: _Carry, live: Flag):
-        carry, (reported, energies, iterations) = scan_of_steps(
+        carry, (reported, energies, costs) = scan_of_steps(
             keep_roots(one_step), carry, jnp.full((save_every,), live)
         )
         last = jax.tree.map(lambda x: x[-1], reported)
         row = (carry.state, *last, jax.tree.map(jnp.sum, energies))
         good = carry.result == RESULTS.successful
-        return carry, (_nan_unless(good, row), iterations)
+        return carry, (nan_unless(good, row), costs)
 
-    result0 = _check_start(scheme, model, start, h)
+    result0 = check_start(scheme, model, start, h)
     begin = _Carry(State(start.q, start.v), warm, result0, jnp.array(0))
-    end, (rows, iterations) = scan_of_rows(one_save, begin, jnp.ones((num_saves,), bool))
+    end, (rows, costs) = scan_of_rows(one_save, begin, jnp.ones((num_saves,), bool))
     states, multipliers, details, energies = rows
     row0 = (begin.state, multipliers0, jax.tree.map(lambda _: jnp.zeros_like(h), energies))
     states, multipliers, energies = jax.tree.map(
@@ -133,6 +206,7 @@ def _run(system, scheme, start, args, h, t0, root_finder, num_steps, save_every)
         row0,
         (states, multipliers, energies),
     )
+    iterations, residuals, halvings = (x.reshape(-1) for x in costs)
     saved = jnp.arange(0, num_steps + 1, save_every, dtype=h.dtype)
     return Solution(
         t0 + h * saved,
@@ -140,53 +214,7 @@ def _run(system, scheme, start, args, h, t0, root_finder, num_steps, save_every)
         multipliers,
         details,
         audit(model, timed(states, saved), *energies),
-        Statistics(iterations.reshape(-1), end.completed),
+        Statistics(iterations, residuals, halvings, end.completed),
+        model.leave(end.state),
         end.result,
     )
-
-
-def _select(good: Flag, new, old):
-    return jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)
-
-
-def _nan_unless(good: Flag, tree):
-    return jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), tree)
-
-
-def _check_start(
-    scheme: AbstractScheme, model: AbstractModel, start: State, h: Scalar
-) -> RESULTS:
-    """Whether the start satisfies what the scheme holds, to half the digits of a step.
-
-    An error there would stay in the energy balance of the first step. The measure is
-    the motion or velocity that would repair it, against those of a step, wherever the
-    origin lies.
-    """
-    scales = model.scales
-    root = jnp.sqrt(model.energy_scale(start, h))
-    # NaN compares false: a start that cannot be measured fails at its first step.
-    tolerance = jnp.sqrt(jnp.finfo(h.dtype).eps)
-    position = jnp.abs(model.constraint(start.q, start.t))
-    rounding = 1e3 * jnp.finfo(h.dtype).eps * scales.constraint_size
-    far = position > 1e2 * tolerance * h * root * scales.constraint + rounding
-    bad = jnp.any(far)
-    if scheme.stage.formulation == "ggl":
-        rate = jnp.abs(model.joint_rate(start.q, start.v, start.t))
-        fast = rate > 1e2 * tolerance * root * scales.constraint[: rate.size]
-        bad = bad | jnp.any(fast)
-    return RESULTS.where(bad, RESULTS.inconsistent_start, RESULTS.successful)
-
-
-def _raise_failure(solution: Solution, h: Scalar, t0: Scalar) -> Solution:
-    failed = solution.result != RESULTS.successful
-    if not is_known((failed, solution.stats.completed_steps, h, t0)):
-        return solution.result.error_if(solution, failed)
-    if failed:
-        done = int(solution.stats.completed_steps)
-        begin, end = (float(t0) + k * float(h) for k in (done, done + 1))
-        raise eqx.EquinoxRuntimeError(
-            f"The run failed in step {done + 1}, from t = {begin:.6g} to {end:.6g}. "
-            f"{RESULTS[solution.result]} "
-            "(`throw=False` returns the run up to there.)"
-        )
-    return solution

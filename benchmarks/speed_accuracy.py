@@ -1,0 +1,170 @@
+"""Error against time: our schemes, explicit integrators and DAE solvers, on one core.
+
+    python benchmarks/speed_accuracy.py [--out FOLDER] [--quick]
+
+Points on rods that fall from the horizontal (one, two, two with an inner mass 200 times
+lighter, 8 and 64 of them) and the heavy top. Ours, with XLA's default settings and with
+`enable_fast_loops()` (two processes); diffrax in minimal coordinates and on the same model
+by `to_diffrax`; SciPy's DOP853; EXUDYN's generalized-alpha method and IDA of SUNDIALS on
+the stabilised index-2 equations (extra `peers`). The error is the largest of any point at
+the end, against an explicit run at tight tolerance. Times are medians, of the processor.
+Right-hand sides and residuals are compiled for diffrax, EXUDYN and ours, and written with
+NumPy for SciPy and IDA: their times are those of users who do the same. Prints, for each
+problem and error, the cheapest run of each solver. Writes speed_accuracy.json and .png.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import harness
+import numpy as np
+from speed_accuracy_peers import diffrax_rows, SOLVERS
+from speed_accuracy_works import Work, WORKS
+
+import enerjax as ej
+
+
+REPEATS, QUICK_REPEATS = 5, 2
+ERRORS = tuple(10.0**-k for k in range(2, 10))
+# What counts as an answer at all.
+BOUND = 0.1
+SCHEMES: dict[str, Callable[[], ej.AbstractScheme]] = {
+    "EnergyConsistent(0)": lambda: ej.EnergyConsistent(0.0),
+    "EnergyPreserving": lambda: ej.EnergyPreserving(),
+    "EnergyDecaying(0.5)": lambda: ej.EnergyDecaying(0.5),
+    "Composed(EnergyPreserving, 4)": lambda: ej.Composed(ej.EnergyPreserving(), 4),
+    "Composed(EnergyConsistent, 6)": lambda: ej.Composed(ej.EnergyConsistent(0.0), 6),
+}
+COLOURS = dict(ours="C0", dae="C3", ode="C2")
+
+
+def our_rows(quick: bool) -> list[harness.Row]:
+    rows: list[harness.Row] = []
+    programs: list[Callable] = []
+    for name, work in WORKS.items():
+        if quick and work.size > 2:
+            continue
+        exact = work.exact()
+        for label, make in SCHEMES.items():
+            for h in work.steps.get(label, ()):
+                row, program = _our_run(name, work, label, make(), h, exact)
+                rows.append(row)
+                programs += [] if program is None else [program]
+    timed = [row for row in rows if row["error"] <= BOUND]
+    repeats = QUICK_REPEATS if quick else REPEATS
+    times = harness.medians(programs, repeats)
+    for row, seconds in zip(timed, times, strict=True):
+        row["seconds"] = seconds
+    # It is in JAX too, and what XLA is told serves it as well.
+    for name, work in WORKS.items():
+        if not (quick and work.size > 2):
+            peers = diffrax_rows(work, work.exact(), repeats)
+            rows += [dict(work=name) | row for row in peers]
+    return [row | harness.device() for row in rows]
+
+
+def _our_run(
+    name: str, work: Work, label: str, scheme: ej.AbstractScheme, h: float, exact: Any
+) -> tuple[harness.Row, Callable | None]:
+    system, start, args = work.problem()
+    steps = round(work.end / h)
+
+    def run(start, args, h) -> ej.Solution:
+        return ej.simulate(
+            system,
+            scheme,
+            start,
+            args,
+            h=h,
+            num_steps=steps,
+            save_every=steps,
+            throw=False,
+        )
+
+    program, _ = harness.compiled(run, start, args, h)
+    solution = program(start, args, h)
+    error = work.error(work.positions(np.asarray(solution.ys.q[-1])), exact)
+    error = error if np.isfinite(error) else float("inf")
+    row = dict(work=name, kind="ours", solver=label, setting=f"h {h:g}", error=error)
+    row["energy"] = float(abs(solution.audit.leak[-1]))
+    return row, (lambda: program(start, args, h)) if error <= BOUND else None
+
+
+def peer_rows(quick: bool) -> list[harness.Row]:
+    repeats = QUICK_REPEATS if quick else 3
+    rows: list[harness.Row] = []
+    for name, work in WORKS.items():
+        if quick and work.size > 2:
+            continue
+        exact = work.exact()
+        for solver in SOLVERS:
+            for row in solver(work, exact, repeats):
+                rows.append(dict(work=name, mode="peer") | row)
+    return rows
+
+
+def cheapest(rows: list[harness.Row], error: float) -> dict[str, float]:
+    """Milliseconds of the cheapest run of each solver that is at least so accurate."""
+    best: dict[str, float] = {}
+    for row in rows:
+        if row["error"] <= error and "seconds" in row:
+            mode = "" if row["mode"] == "peer" else f", {row['mode']}"
+            key = f"{row['kind']}: {row['solver']}{mode}"
+            best[key] = min(best.get(key, np.inf), 1e3 * row["seconds"])
+    return best
+
+
+def show(rows: list[harness.Row]) -> None:
+    for name in WORKS:
+        here = [row for row in rows if row["work"] == name]
+        if not here:
+            continue
+        tables = [cheapest(here, error) for error in ERRORS]
+        print(f"\n{name}: ms to an error of" + "".join(f"{e:9.0e}" for e in ERRORS))
+        for solver in sorted({solver for table in tables for solver in table}):
+            cells = (f"{t[solver]:9.3g}" if solver in t else " " * 9 for t in tables)
+            print(f"  {solver:42s}" + "".join(cells))
+        for kind in ("dae", "ode"):
+            print(f"  {'best ' + kind + ' / best ours':42s}" + _ratios(tables, kind))
+
+
+def _ratios(tables: list[dict[str, float]], kind: str) -> str:
+    """How many times longer the best solver of a kind takes than the best of ours."""
+    best = lambda table, kind: min(
+        (ms for solver, ms in table.items() if solver.startswith(kind)), default=np.inf
+    )
+    pairs = [(best(table, kind), best(table, "ours")) for table in tables]
+    return "".join(
+        f"{theirs / ours:9.2g}" if np.isfinite(theirs + ours) else f"{'-':>9s}"
+        for theirs, ours in pairs
+    )
+
+
+def draw(rows: list[harness.Row], path: Path) -> None:
+    import matplotlib.pyplot as plt
+
+    names = [name for name in WORKS if any(row["work"] == name for row in rows)]
+    figure, axes = plt.subplots(2, -(-len(names) // 2), figsize=(13, 8), squeeze=False)
+    for axis, name in zip(axes.ravel(), names, strict=False):
+        here = [r for r in rows if r["work"] == name and "seconds" in r]
+        for solver, mode in sorted({(r["solver"], r["mode"]) for r in here}):
+            line = sorted(
+                (r["seconds"], r["error"], r["kind"])
+                for r in here
+                if (r["solver"], r["mode"]) == (solver, mode)
+            )
+            seconds, errors, kinds = zip(*line, strict=True)
+            style = "--" if mode == "default" else "-"
+            axis.loglog(seconds, errors, style, marker=".", color=COLOURS[kinds[0]])
+            axis.annotate(solver, (seconds[-1], errors[-1]), fontsize=5)
+        axis.set(title=name, xlabel="seconds of computation", ylabel="error at the end")
+    figure.suptitle(
+        "ours (blue; dashed: default XLA), DAE solvers (red), explicit ODE (green)"
+    )
+    figure.tight_layout()
+    figure.savefig(path, dpi=130)
+
+
+if __name__ == "__main__":
+    harness.run(__file__, our_rows, show, draw, peer_rows)

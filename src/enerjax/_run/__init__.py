@@ -1,0 +1,2 @@
+from .controller import StepController as StepController
+from .simulate import simulate as simulate

@@ -1,0 +1,219 @@
+"""Steps of varying length, from an estimate of the error that each one makes."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
+from jaxtyping import Array, Float
+
+from .._model import AbstractModel
+from .._results import RESULTS
+from .._root import ROOT
+from .._schemes import AbstractCarryingSolve, AbstractScheme
+from .._step import StepOutput, Warm
+from .._system import State
+from .._tracing import is_known
+from .._types import Count, Flag, Real, Scalar
+from .collocation import end_of, Pair, rates, rates_along
+from .pace import AbstractPace, Verdict
+from .prediction import for_length, with_history
+
+
+def _as_tolerance(tolerance: Real) -> Scalar:
+    array = jnp.asarray(tolerance, float)
+    if is_known(array) and not (array.ndim == 0 and 0 < float(array) < jnp.inf):
+        raise ValueError(
+            f"The tolerances of a `StepController` must be positive, got {tolerance}: "
+            "`StepController(rtol=1e-6, atol=1e-8)` allows each step errors of a "
+            "millionth of the coordinates, and of 1e-8 where they are small."
+        )
+    return array
+
+
+class StepController(eqx.Module):
+    """Chooses the steps of `simulate(..., t1=..., controller=...)` by their errors.
+
+    Each step is compared with the integral of the equations of motion along it: Picard's
+    iteration on Lobatto's nodes, from Hermite's polynomial through its ends. For schemes of
+    orders 1 to 4 the difference `d` is the error of the step itself, up to terms of higher
+    order; for orders 6 and 8 that of the integral, which is of order 5 and 7. A step is
+    accepted if
+
+        sqrt(mean((d / (atol + rtol max(|y0|, |y1|)))^2)) <= 1
+
+    over all coordinates and velocities (momenta of a Hamiltonian system), and otherwise
+    repeated, shorter; so is a step in which Newton's method fails, with a quarter of its
+    length. A PI controller with factors in [0.2, 5] proposes the next length. Every step
+    keeps energy and constraints as the scheme promises, at any length.
+
+    **Arguments:**
+
+    - `rtol`, `atol`: tolerances, positive; traced, so that they can be swept. `atol` has
+      the unit of each entry of `q` and `v`.
+
+    **Raises:** `ValueError` for tolerances that are not positive.
+
+    **Reference:** K. Gustafsson, ACM Trans. Math. Softw. 17 (1991) 533-554, for the
+    controller; E. Hairer, S. P. Norsett and G. Wanner, Solving Ordinary Differential
+    Equations I, section II.4, for the norm; A. Dutt, L. Greengard and V. Rokhlin, BIT 40
+    (2000) 241-266, for the iteration.
+    """
+
+    rtol: Scalar = eqx.field(converter=_as_tolerance)
+    atol: Scalar = eqx.field(converter=_as_tolerance)
+
+
+class _Memory(eqx.Module):
+    # Of the step to come, and of the last three that were accepted, newest first.
+    length: Scalar
+    before: Float[Array, "3"]
+    # Of the last accepted step.
+    error: Scalar
+    # Whether a step was rejected since, and whether one was for its error.
+    rejected: Flag
+    inaccurate: Flag
+    # The rates of change in the state that is reached.
+    rates: Pair
+
+
+# A step that Newton's method fails in is cut to this part.
+_CUT = 0.25
+_SAFETY = 0.9
+_SHORTER, _LONGER = 0.2, 5.0
+
+
+class ControlledSteps(AbstractPace):
+    """The steps of a `StepController`. Nothing is differentiated by their lengths."""
+
+    controller: StepController
+    first_length: Scalar
+    order: int = eqx.field(static=True)
+    stages: tuple[float, ...] = eqx.field(static=True)
+
+    def begin(self, model: AbstractModel, start: State) -> _Memory:
+        first = self.first()
+        at_start = _constant(rates(model, start))
+        same, one = jnp.full((3,), first), jnp.ones_like(first)
+        no = jnp.array(False)
+        return _Memory(first, same, one, no, no, at_start)
+
+    def first(self) -> Scalar:
+        return jax.lax.stop_gradient(jnp.minimum(self.first_length, 1.0))
+
+    def next(
+        self, memory: _Memory, begin: Scalar, completed: Count
+    ) -> tuple[Scalar, Scalar]:
+        # The last two steps share what is left, and none is tiny.
+        left = 1 - begin
+        last = left <= 1.01 * memory.length
+        length = jnp.minimum(memory.length, 0.5 * left)
+        length = jnp.where(last, left, length)
+        return jnp.where(last, 1.0, begin + length), length
+
+    def warm(self, memory: _Memory, warm: Warm, length: Scalar) -> Warm:
+        return for_length(warm, self.stages, memory.before, length)
+
+    def kept(self, new: Warm, old: Warm) -> Warm:
+        return with_history(new, old)
+
+    def judge(
+        self,
+        memory: _Memory,
+        model: AbstractModel,
+        begin: State,
+        out: StepOutput,
+        h: Scalar,
+        length: Scalar,
+    ) -> Verdict:
+        known = _constant((model, begin, out.state, h, memory.rates))
+        error, reached = _constant(self._error(*known))
+        solved = out.result == RESULTS.successful
+        accepted = solved & (error <= 1)
+        power = 1 / estimate_order(self.order)
+        error = jnp.maximum(error, 1e-4)
+        grown = _SAFETY * error ** (-0.7 * power) * memory.error ** (0.4 * power)
+        grown = jnp.clip(grown, _SHORTER, jnp.where(memory.rejected, 1.0, _LONGER))
+        shrunk = jnp.maximum(_SAFETY * error**-power, _SHORTER)
+        # An error that is no number compares false.
+        shrunk = jnp.where(solved & (error < jnp.inf), shrunk, _CUT)
+        next_length = length * jnp.where(accepted, grown, shrunk)
+        next_length = jax.lax.stop_gradient(next_length)
+        # The reverse pass is spared the estimates.
+        accepted, next_length = checkpoint_name((accepted, next_length), ROOT)
+        too_short = ~accepted & (next_length < jnp.finfo(length.dtype).eps ** 0.75)
+        inaccurate = ~accepted & (solved | memory.inaccurate)
+        cause = RESULTS.where(inaccurate, RESULTS.steps_too_short, out.result)
+        before = jnp.concatenate([length[None], memory.before[:2]])
+        choose = lambda new, old: jnp.where(accepted, new, old)
+        after = _Memory(
+            next_length,
+            choose(before, memory.before),
+            choose(error, memory.error),
+            ~accepted,
+            inaccurate,
+            jax.tree.map(choose, reached, memory.rates),
+        )
+        return Verdict(accepted, RESULTS.where(too_short, cause, RESULTS.successful), after)
+
+    def _error(
+        self, model: AbstractModel, a: State, b: State, h: Scalar, at_start: Pair
+    ) -> tuple[Scalar, Pair]:
+        """The norm of the error of a step, and the rates at its end."""
+        at_end = rates(model, b)
+        other = other_end(model, a, b, h, (at_start, at_end), self.order)
+        join = lambda x: jnp.concatenate([x.q, x.v])
+        x, y, z = join(a), join(b), join(other)
+        rtol, atol = (
+            x.astype(h.dtype) for x in (self.controller.rtol, self.controller.atol)
+        )
+        off = (y - z) / (atol + rtol * jnp.maximum(jnp.abs(x), jnp.abs(y)))
+        return jnp.sqrt(jnp.mean(off**2)), at_end
+
+
+def _constant(tree: Any) -> Any:
+    """The same without derivatives."""
+    hold = lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x
+    return jax.tree.map(hold, tree)
+
+
+def estimate_order(order: int) -> int:
+    """The power of `h` that the estimate of a scheme of this order shrinks with."""
+    return max(order, 2) + 1 if order <= 4 else order
+
+
+def other_end(
+    model: AbstractModel,
+    a: State,
+    b: State,
+    h: Scalar,
+    at_ends: tuple[Pair, Pair],
+    order: int,
+) -> State:
+    """The end of a step from `a` to `b` by the integral of the rates along it.
+
+    Its own error is `h^(order + 2)` up to order 4, and `h^order` above.
+    """
+    nodes = max(order if order <= 4 else order - 2, 3)
+    f = rates_along(model, a, b, h, at_ends, nodes, nodes - 3)
+    return end_of(a, h, f, b.t)
+
+
+def controlled(
+    controller: StepController, scheme: AbstractScheme, first_length: Scalar
+) -> ControlledSteps:
+    """The steps of a scheme, the first of which is a part `first_length` of the run."""
+    if not isinstance(controller, StepController):
+        raise TypeError(
+            "`controller` must be a `StepController(rtol, atol)`, got "
+            f"{controller!r}"
+            + (": the parentheses are missing." if controller is StepController else ".")
+        )
+    if isinstance(scheme.stage, AbstractCarryingSolve):
+        raise ValueError(
+            f"`{type(scheme).__name__}` carries an acceleration from step to step that "
+            "belongs to one length of the steps, so no `controller` can vary it. Give `h` "
+            "and `t1` alone, or take a scheme of one step, such as `EnergyDecaying`."
+        )
+    return ControlledSteps(controller, first_length, scheme.order, scheme.stages)

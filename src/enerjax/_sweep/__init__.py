@@ -1,0 +1,2 @@
+from .labelled import Sweep as Sweep
+from .sweep import sweep as sweep

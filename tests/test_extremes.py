@@ -1,0 +1,75 @@
+"""Where the schemes hold, on the cheap axes of the map that `benchmarks/extremes.py` draws.
+
+Its functions compare with closed forms and say by what errors are bounded.
+"""
+
+import functools
+
+import extremes_numbers as numbers
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from extremes_runs import REPORTED, RIGHT, WRONG
+
+import enerjax as ej
+
+
+def verdicts(rows):
+    rows = list(rows)
+    assert rows
+    return rows, {row.verdict for row in rows}
+
+
+@functools.cache
+def steps():
+    return list(numbers.step_rows(quick=True))
+
+
+def test_a_linear_spring_is_right_at_every_step():
+    rows = [row for row in steps() if row.case != "quartic spring"]
+    assert len(rows) > 30
+    assert [row for row in rows if row.verdict != RIGHT] == []
+
+
+def test_a_stiff_quartic_spring_is_right_or_says_that_it_failed():
+    rows = [row for row in steps() if row.case == "quartic spring" and row.x <= 100]
+    assert {row.verdict for row in rows} <= {RIGHT, REPORTED}
+    assert {row.verdict for row in rows if row.x <= 1} == {RIGHT}
+
+
+@pytest.mark.xfail(strict=True, reason="Newton takes small corrections for convergence")
+def test_a_quartic_spring_far_too_stiff_for_the_step_is_not_called_a_success():
+    rows = [row for row in steps() if row.case == "quartic spring" and row.x > 100]
+    assert WRONG not in {row.verdict for row in rows}
+
+
+def test_motion_that_dies_out_away_from_zero_stays_at_rest():
+    """Where terms cancel, what is left of the forces is round-off, not motion."""
+    _, found = verdicts(numbers.settling_rows(quick=True))
+    assert found == {RIGHT}
+
+
+def test_slow_motion_beside_a_stiff_spring_is_right():
+    rows, _ = verdicts(numbers.stiffness_rows(quick=True))
+    # The force of the stiffest is rounded by more than the others are; see the README.
+    lost = [row for row in rows if row.verdict != RIGHT]
+    assert all(row.x == 1e14 and "Consistent" in row.scheme for row in lost)
+    assert all(row.error <= 1e-3 for row in lost)
+
+
+@pytest.mark.parametrize("scheme", [ej.EnergyPreserving(), ej.EnergyDecaying(0.5)])
+def test_an_equilibrium_is_kept_and_can_be_differentiated(scheme):
+    system, _, args = ej.problems.pendulum()
+    start = ej.State([0.0, 1.0], [0.0, 0.0])
+
+    def ends(g):
+        run = ej.simulate(system, scheme, start, args | dict(g=g), h=0.01, num_steps=20)
+        return run.ys.q[-1]
+
+    values, slopes = jax.vmap(lambda g: (ends(g), jax.jacfwd(ends)(g)))(
+        jnp.array([9.81, 0])
+    )
+    np.testing.assert_array_equal(values, [[0.0, 1.0], [0.0, 1.0]])
+    # The rod takes what gravity gives: nothing moves.
+    np.testing.assert_allclose(slopes, 0, atol=1e-15)
