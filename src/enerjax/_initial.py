@@ -52,14 +52,7 @@ def initial_state(
     As `consistent_start`, of which it returns the state alone: the one that is given, where
     it satisfies them to round-off already.
     """
-    given, checked = check_system(system, State(q, v), args, t)
-    if is_known((system, given, checked)):
-        met = _is_met(system, given, checked)
-        # A small program spares the compilation of a large one.
-        if is_known(met) and met:
-            return State(given.q, given.v)
-    start = consistent_start(system, q, v, args, t=t, known_q=known_q, known_v=known_v)
-    return start.state
+    return _nearest(system, State(q, v), args, t, known_q, known_v, firmly=True)
 
 
 def consistent_start(
@@ -106,7 +99,26 @@ def start_near(
 ) -> State:
     """As `initial_state`, but known velocities give way where the joints do not admit
     them."""
-    return _start(system, state, args, t, (), known_v, firmly=False).state
+    return _nearest(system, state, args, t, (), known_v, firmly=False)
+
+
+def _nearest(
+    system: AbstractSystem,
+    state: State,
+    args: Args,
+    t: Real,
+    known_q: Sequence[int],
+    known_v: Sequence[int],
+    *,
+    firmly: bool,
+) -> State:
+    given, checked = check_system(system, state, args, t)
+    if is_known((system, given, checked)):
+        met = _is_met(system, given, checked)
+        # A small program spares the compilation of a large one.
+        if is_known(met) and met:
+            return State(given.q, given.v)
+    return _start(system, state, args, t, known_q, known_v, firmly=firmly).state
 
 
 def _start(

@@ -84,8 +84,7 @@ def freedoms(
 ) -> Mobility:
     """`mobility`, with rows that stand `first`, before those that may follow from them."""
     state, args = check_system(system, state, args, t)
-    gradients, root, residual = linearised(system, state, args)
-    scaled = unit_rows(gradients)
+    scaled, root, residual = scaled_constraints(system, state, args)
     num_constraints, num_coordinates = scaled.shape
     if names is None:
         names = [str(k) for k in range(num_constraints)]
@@ -134,42 +133,29 @@ def independent_rows(scaled: np.ndarray, first: Sequence[int] = ()) -> list[int]
     return sorted(np.argsort(-own, kind="stable")[:rank].tolist())
 
 
-def unit_rows(gradients: np.ndarray) -> np.ndarray:
-    """Constraints in units of their own: rows of length one."""
-    lengths = np.linalg.norm(gradients, axis=1, keepdims=True)
-    return gradients / np.where(lengths > 0, lengths, 1.0)
+def scaled_constraints(
+    system: AbstractSystem, state: State, args: Args
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`dPhi/dq` in units of the constraints and the inertia, the root of the inertia, and
+    the residual in parts of the sizes of the constraints.
 
-
-class Linearised(NamedTuple):
-    """The constraints and the inertia in one pose.
-
-    - `gradients`: `dPhi/dq` in the metric of the inertia.
-    - `root`: the lower triangular root of that metric.
-    - `residual`: how far each constraint is violated, in parts of its size.
+    Those are of their terms, and of the change that would come of moving the pose as far
+    as it is from the origin: the terms of a constraint can vanish.
     """
-
-    gradients: np.ndarray
-    root: np.ndarray
-    residual: np.ndarray
-
-
-def linearised(system: AbstractSystem, state: State, args: Args) -> Linearised:
-    """Of numbers, not of traced values."""
-    metric, jacobian, residual, size = map(np.asarray, _evaluated(system, state, args))
+    metric, jacobian, residual, size = map(np.asarray, _linearised(system, state, args))
     root = np.linalg.cholesky(metric)
-    gradients = scipy.linalg.solve_triangular(root, jacobian.T, lower=True).T
-    # The size of the terms of a constraint, or of its change where the whole pose is moved
-    # as far as it is from the origin: terms can vanish, too.
-    extent = np.linalg.norm(root.T @ np.asarray(state.q))
-    size = size + extent * np.linalg.norm(gradients, axis=1)
-    return Linearised(gradients, root, residual / np.where(size > 0, size, 1.0))
+    scaled = scipy.linalg.solve_triangular(root, jacobian.T, lower=True).T
+    lengths = np.linalg.norm(scaled, axis=1)
+    unit = np.where(lengths > 0, lengths, 1.0)
+    size = size + lengths * np.linalg.norm(root.T @ np.asarray(state.q))
+    return scaled / unit[:, None], root, residual / np.where(size > 0, size, 1.0)
 
 
 @eqx.filter_jit
-def _evaluated(
+def _linearised(
     system: AbstractSystem, state: State, args: Args
 ) -> tuple[Array, Array, Array, Array]:
-    """One program: the inertia in the coordinates; `dPhi/dq`, `Phi`, and its terms."""
+    """The inertia in the coordinates; the constraints: gradients, residuals, sizes."""
     model = make_model(system, state, args)
     metric = as_dense(model.metric(model.enter(state)))
     jacobian = jax.jacfwd(model.constraint)(state.q, state.t)

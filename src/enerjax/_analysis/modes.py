@@ -14,7 +14,7 @@ from .._system import AbstractSystem, State
 from .._tracing import is_known
 from .._types import Args, Coordinates, Real, Scalar
 from .equilibrium import at_rest
-from .mobility import independent_rows, linearised, unit_rows
+from .mobility import independent_rows, scaled_constraints
 
 
 # Forces out of balance, in parts of all forces, above which a pose is no equilibrium.
@@ -85,8 +85,7 @@ def _independent(system: AbstractSystem, rest: State, args: Args) -> tuple[int, 
             "is not known under `jit` and `vmap`: call `modes` outside of them, or leave "
             "out the constraints that repeat others."
         )
-    gradients = linearised(system, rest, args).gradients
-    return tuple(independent_rows(unit_rows(gradients)))
+    return tuple(independent_rows(scaled_constraints(system, rest, args)[0]))
 
 
 class _Balance(NamedTuple):
