@@ -23,7 +23,7 @@ def fit(
     data: PyTree[Any] = None,
     *,
     positive: PyTree[bool] = False,
-    solver: Solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8),
+    solver: Solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6),
     max_steps: int = 256,
     throw: bool = True,
 ) -> Fit:
@@ -61,8 +61,10 @@ def fit(
     - `positive`: which parameters are positive, a pytree of flags like `guess`, or one
       flag for a part of it. Their logarithms are sought.
     - `solver`: of optimistix, for least squares or a minimiser such as `optimistix.BFGS`
-      (which takes reverse derivatives: fewer runs where parameters are many).
-    - `max_steps`: of the solver.
+      (which takes reverse derivatives: fewer runs where parameters are many). Its
+      tolerances ask for no more than noisy data can tell.
+    - `max_steps`: of the solver. A positive parameter that the data would rather have
+      at zero, such as a damper that is not there, takes all of them.
     - `throw`: raise an error for a fit that failed; with `False` look at `result`.
 
     **Returns:** a `Fit`.
@@ -77,7 +79,7 @@ def fit(
     if not isinstance(solver, Solver):
         raise TypeError(
             "`solver` must be one of optimistix for least squares or for minimisation, "
-            "such as `optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-8)`; got "
+            "such as `optimistix.LevenbergMarquardt(rtol=1e-6, atol=1e-6)`; got "
             f"{solver!r}."
         )
     max_steps = positive_integer("max_steps", max_steps)
