@@ -1,0 +1,128 @@
+"""Sweeps that are written, resumed, and shared among devices and processes."""
+
+import os
+import pathlib
+import re
+import socket
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+import enerjax as ej
+
+from .test_sweep import arithmetic, here
+
+
+ROOT = pathlib.Path(__file__).parent.parent
+
+
+def counting(calls):
+    def progress(done, total):
+        del total
+        calls.append(done)
+
+    return progress
+
+
+def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
+    over = {"a": np.arange(6.0), "b": [1.0]}
+    first = ej.sweep(arithmetic, over, chunk=2, path=tmp_path)
+    (tmp_path / "chunk-000001.npz").unlink()
+    before = {file.name: file.stat().st_mtime_ns for file in tmp_path.iterdir()}
+    again = ej.sweep(arithmetic, over, chunk=2, path=tmp_path)
+    np.testing.assert_array_equal(again.values["sum"], first.values["sum"])
+    after = {file.name: file.stat().st_mtime_ns for file in tmp_path.iterdir()}
+    assert set(after) - set(before) == {"chunk-000001.npz"}
+    assert all(after[name] == time for name, time in before.items())
+
+
+def test_another_sweep_is_not_resumed(tmp_path):
+    over = {"a": [1.0, 2.0], "b": [1.0]}
+    gravity = 9.81
+    weight = lambda a, b: gravity * a + b
+    ej.sweep(weight, over, path=tmp_path)
+    others = [
+        (weight, over | {"a": [1.0, 3.0]}, {}, "parameters"),
+        (weight, over, {"chunk": 1}, "chunks"),
+        (lambda a, b: {"weight": 9.81 * a + b}, over, {}, "results"),
+        (lambda a, b: 1.6 * a + b, over, {}, "program"),
+        (lambda a, b: 9.81 * b + a, over, {}, "program"),
+        (lambda a, b: np.array(9.82) * a + b, over, {}, "program"),
+        (lambda a, b: jax.lax.fori_loop(0, 3, lambda _, x: x + b, a), over, {}, "program"),
+    ]
+    for fn, parameters, options, part in others:
+        with pytest.raises(ValueError, match=f"another sweep .different: .*{part}"):
+            ej.sweep(fn, parameters, path=tmp_path, **options)
+    # A loop of another length is another program, though no shape tells.
+    loop = lambda n: lambda a, b: jax.lax.fori_loop(0, n, lambda _, x: x + b, a)
+    ej.sweep(loop(3), over, path=tmp_path / "loop")
+    ej.sweep(loop(3), over, path=tmp_path / "loop")
+    with pytest.raises(ValueError, match="another sweep .different: program."):
+        ej.sweep(loop(4), over, path=tmp_path / "loop")
+
+
+def process(*arguments, devices=1, **options):
+    """The sweep in a process of its own."""
+    environment = os.environ | {
+        "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
+        "JAX_PLATFORMS": "cpu",
+        # Another order of sets and dictionaries must not make another program.
+        "PYTHONHASHSEED": str(devices),
+    }
+    command = [sys.executable, "-m", "tests.swept", *map(str, arguments)]
+    return subprocess.Popen(
+        command, cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True, **options
+    )
+
+
+def finished(started):
+    _, errors = started.communicate(timeout=300)
+    assert started.returncode == 0, errors
+
+
+def compare(file):
+    """Solver: other devices, other batches."""
+    with np.load(file) as found:
+        for name in ("q", "drift"):
+            expected = here().values[name]
+            np.testing.assert_allclose(found[name], expected, rtol=0, atol=1e-12)
+
+
+def test_a_killed_sweep_goes_on_on_other_devices(tmp_path):
+    folder, result = tmp_path / "sweep", tmp_path / "result.npz"
+    killed = process(result, "--path", folder, "--die-after", 16)
+    killed.communicate(timeout=300)
+    assert killed.returncode == -9
+    assert not result.exists()
+    done = {file: file.stat().st_mtime_ns for file in folder.glob("chunk-*.npz")}
+    assert sorted(file.name[6:12] for file in done) == ["000000", "000001"]
+    finished(process(result, "--path", folder, devices=2))
+    assert all(file.stat().st_mtime_ns == time for file, time in done.items())
+    assert len(list(folder.glob("chunk-*.npz"))) == 4
+    compare(result)
+
+
+def test_two_processes_find_what_one_finds(tmp_path):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    results = [tmp_path / f"{k}.npz" for k in range(2)]
+    folder = tmp_path / "sweep"
+    options = ("--path", folder, "--port", port)
+    both = [process(results[k], *options, "--process", k) for k in range(2)]
+    for started in both:
+        finished(started)
+    for file in results:
+        compare(file)
+    assert len(list(folder.glob("chunk-*.npz"))) == 4
+
+
+def test_drafts_are_no_results(tmp_path):
+    """What a process leaves that is killed while it writes."""
+    (tmp_path / ".chunk-000000.npz.1").write_bytes(b"half")
+    found = ej.sweep(arithmetic, {"a": [1.0], "b": [2.0]}, path=tmp_path)
+    assert re.search("1 lanes", str(found))
+    assert found.values["sum"] == 3
