@@ -75,7 +75,8 @@ class Chunk:
         extra = self.padded - self.lanes
         fill = lambda x: np.concatenate([x, np.repeat(x[-1:], extra, axis=0)])
         results = self._program(jax.tree.map(fill, parameters))
-        return [np.asarray(x)[: self.lanes] for x in jax.tree.leaves(results)]
+        # Copied: on CPUs a view would keep the memory of the device.
+        return [np.array(x)[: self.lanes] for x in jax.tree.leaves(results)]
 
 
 def digest(traced: ClosedJaxpr) -> str:
