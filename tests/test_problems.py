@@ -200,7 +200,7 @@ def test_a_chain_of_links_falls_without_losing_energy():
 
 
 def test_problems_with_other_numbers_share_a_program(caplog):
-    problem("pendulum")
+    ej.problems.pendulum()
     with jax.log_compiles():
         ej.problems.pendulum(m=2.0, l=1.5, g=1.6)
     assert not [r for r in caplog.records if "Compiling" in r.getMessage()]
