@@ -114,7 +114,7 @@ class CanonicalModel(AbstractModel):
         middle = 0.5 * (a.q + b.q), 0.5 * (a.v + b.v)
         masses = self.system.masses(*middle, self.args)
         weights = jnp.concatenate([masses, h**2 / masses])
-        size = action_size(self, derivative, a, h, increment)
+        terms = action_size(self, derivative, a, h, increment)
         both, work = gradient_and_work(
             derivative,
             action,
@@ -122,7 +122,7 @@ class CanonicalModel(AbstractModel):
             (jnp.concatenate([a.q, a.v]), a.t),
             (jnp.concatenate([b.q, b.v]), b.t),
             weights,
-            size,
+            terms,
         )
         return Drive(both[:size], both[size:] / h, work)
 
