@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import enerjax as ej
 
@@ -61,6 +62,13 @@ SCHEMES = {
     "consistent 6": lambda alpha: ej.Composed(ej.EnergyConsistent(0.0), 6),
     "consistent 8": lambda alpha: ej.Composed(ej.EnergyConsistent(0.0), 8),
 }
+
+
+def long(names, *slow):
+    """Parameters of a test, of which those that take long are left to `-m slow`."""
+    assert set(slow) <= set(names)
+    mark = [pytest.mark.slow]
+    return [pytest.param(x, marks=mark if x in slow else []) for x in names]
 
 
 @functools.cache

@@ -9,6 +9,8 @@ import pytest
 
 import enerjax as ej
 
+from .helpers import long
+
 
 MATRIX = jnp.asarray(np.random.default_rng(0).normal(size=(4, 4)))
 POINT = jnp.array([0.3, -0.8, 1.1, 0.6])
@@ -119,7 +121,7 @@ def test_no_rule_is_missing_and_the_points_are_interchangeable(name):
     np.testing.assert_allclose(forth, back, rtol=1e-12, atol=1e-13)  # round-off
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.parametrize("name", long(FUNCTIONS, "solve", "determinant", "inverse"))
 def test_at_one_point_it_is_the_gradient_and_half_the_hessian(name):
     function = FUNCTIONS[name]
     gradient = lambda b: ej.discrete_grad(function)(POINT, b)
@@ -229,6 +231,7 @@ def test_unlike_or_complex_points_are_refused():
         ej.discrete_grad(jnp.sin)(POINT, POINT)
 
 
+@pytest.mark.slow
 def test_the_preserving_scheme_keeps_angular_momentum_with_it():
     system, start, args = ej.problems.four_particles()
 

@@ -80,6 +80,7 @@ def test_a_decimal_length_takes_no_step_more():
         assert jax.eval_shape(run).stats.newton_iterations.size == count
 
 
+@pytest.mark.slow
 def test_a_run_out_of_steps_says_so():
     options = dict(ts=[0.0, 0.25, END], max_steps=20)
     sol = until("pendulum", ej.EnergyPreserving(), STEP, END, throw=False, **options)

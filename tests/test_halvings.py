@@ -64,6 +64,7 @@ def test_lanes_are_halved_on_their_own(lane):
     np.testing.assert_allclose(alone.ys.q, together.ys.q, rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_step_in_two_parts_is_two_steps():
     solution = run(0.5)
     halved = int(np.argmax(solution.stats.halvings))
@@ -76,6 +77,7 @@ def test_a_step_in_two_parts_is_two_steps():
     np.testing.assert_allclose(solution.ys.q[halved + 1], start.q, rtol=0, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_derivatives_run_through_the_parts():
     last = lambda h: run(h).ys.q[-1, 0]
     slope, step = float(jax.grad(last)(0.5)), 1e-6

@@ -90,6 +90,7 @@ def rods(parameters, state, h, steps, every):
     )
 
 
+@pytest.mark.slow
 def test_masses_lengths_and_gravity_through_the_rods_of_a_double_pendulum():
     times = 0.1 * np.arange(1, 11)
     exact = np.array([double_pendulum_reference(t, m2=2.0).q for t in times])

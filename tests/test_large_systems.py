@@ -193,6 +193,7 @@ def test_lanes_of_chains_move_alone():
     assert jnp.max(jnp.abs(both[0] - alone)) <= 1e-11  # solver
 
 
+@pytest.mark.slow
 def test_repeated_constraints_of_a_large_system_are_reported():
     system, start, args = ej.problems.chain(300)
     assert isinstance(system, ej.System)

@@ -9,7 +9,7 @@ import pytest
 
 import enerjax as ej
 
-from .helpers import problem, SCHEMES, solve
+from .helpers import long, problem, SCHEMES, solve
 
 
 # Round-off of a few hundred steps, compiled in another way.
@@ -17,7 +17,9 @@ SAME: dict[str, Any] = dict(rtol=0, atol=1e-12)
 H, STEPS = 0.01, 100
 
 
-@pytest.mark.parametrize("scheme", ["decaying", "consistent", "composed 4"])
+@pytest.mark.parametrize(
+    "scheme", long(["decaying", "consistent", "composed 4"], "decaying", "composed 4")
+)
 def test_a_loop_over_step_is_a_run(scheme):
     system, start, args = problem("pendulum")
     make = SCHEMES[scheme](0.5)

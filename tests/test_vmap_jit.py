@@ -10,7 +10,7 @@ import pytest
 
 import enerjax as ej
 
-from .helpers import problem, SCHEMES
+from .helpers import long, problem, SCHEMES
 
 
 # Solver: lanes are compiled differently, and Newton stops a few eps apart.
@@ -64,7 +64,7 @@ def test_vmap_equals_a_loop(swept):
         compare(batch, k, run(one))
 
 
-@pytest.mark.parametrize("scheme", ["consistent", "composed 4"])
+@pytest.mark.parametrize("scheme", long(["consistent", "composed 4"], "composed 4"))
 def test_vmap_over_everything_equals_a_loop(scheme):
     numbers = lanes()
     batch = eqx.filter_vmap(lambda x: run(x, scheme))(numbers)

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ._types import Flag, Scalar
+from ._types import Flag
 
 
 class RESULTS(eqx.Enumeration):
@@ -59,9 +59,9 @@ def first_failure(old: RESULTS, new: RESULTS) -> RESULTS:
     return RESULTS.where(old == RESULTS.successful, new, old)
 
 
-def from_root_finder(found: Flag, broken: Flag, residual: Scalar) -> RESULTS:
-    """What the end of an iteration means for a step."""
-    breakdown = RESULTS.where(jnp.isfinite(residual), RESULTS.singular, RESULTS.nonfinite)
+def from_root_finder(found: Flag, broken: Flag, finite: Flag) -> RESULTS:
+    """What the end of an iteration, with a finite residual or not, means for a step."""
+    breakdown = RESULTS.where(finite, RESULTS.singular, RESULTS.nonfinite)
     failure = RESULTS.where(broken, breakdown, RESULTS.not_converged)
     return RESULTS.where(found, RESULTS.successful, failure)
 

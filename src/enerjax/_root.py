@@ -35,7 +35,8 @@ class Root(eqx.Module):
     - `iterations`: corrections made.
     - `residual`: its largest entry; of `Newton` before the last correction.
     - `found`: whether they converged.
-    - `broken`: whether they became singular, or non-finite with the residual.
+    - `broken`: whether they became singular or non-finite.
+    - `finite`: whether the residual is.
     """
 
     value: PyTree[Array]
@@ -44,6 +45,7 @@ class Root(eqx.Module):
     residual: Scalar
     found: Flag
     broken: Flag
+    finite: Flag
 
 
 def _flattened(fn: Callable, value: PyTree[Array]) -> tuple[Array, Callable, Callable]:
@@ -74,7 +76,13 @@ def _search(
         steps = solution.stats["num_steps"]
         residual = max_norm(fn(solution.value, args))
         return Root(
-            solution.value, start.factors, steps, residual, found, singular | nonfinite
+            solution.value,
+            start.factors,
+            steps,
+            residual,
+            found,
+            singular | nonfinite,
+            jnp.isfinite(residual),
         )
     flat, unravel, flat_fn = _flattened(fn, start.guess)
     given, fill = root_finder.linear_solver, _flat(start.fill)
@@ -83,7 +91,13 @@ def _search(
     keeps = residual.keeps_factors and start.factors is not None
     factors = last.factors if keeps else start.factors
     return Root(
-        unravel(last.x), factors, last.corrections, last.defect, last.done, last.broken
+        unravel(last.x),
+        factors,
+        last.corrections,
+        last.defect,
+        last.done,
+        last.broken,
+        jnp.isfinite(last.defect),
     )
 
 
@@ -99,7 +113,7 @@ def _root_jvp(primals, tangents):
     root = _root(fn, root_finder, args, start, max_iterations)
     # All that the derivatives of a step need of the search for it.
     root = eqx.tree_at(
-        lambda root: (root.value, root.residual, root.found, root.broken),
+        lambda root: (root.value, root.found, root.broken, root.finite),
         root,
         replace_fn=lambda x: jax.tree.map(lambda x: checkpoint_name(x, ROOT), x),
     )

@@ -156,7 +156,7 @@ def solve(
     z = jax.tree.map(jnp.multiply, root.value, unknown_scale)
     end = scheme.finish(z, problem)
     # What the scheme itself can tell of a failed iterate says more than that it failed.
-    result = from_root_finder(root.found, root.broken, root.residual)
+    result = from_root_finder(root.found, root.broken, root.finite)
     turned = RESULTS.where(
         _turns(model, start, end.state), RESULTS.step_too_large, RESULTS.successful
     )
