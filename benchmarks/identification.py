@@ -39,8 +39,9 @@ def damped(q: jax.Array, v: jax.Array, t: jax.Array, args: Any) -> jax.Array:
 
 def points(parameters: dict[str, Any], finer: int = 1) -> jax.Array:
     """Of both masses, released at rest; angles from the level, downwards."""
-    system, _, args = ej.problems.double_pendulum()
-    system = ej.System(system.kinetic, system.potential, system.constraint, force=damped)
+    plain, _, args = ej.problems.double_pendulum()
+    assert isinstance(plain, ej.System)
+    system = ej.System(plain.kinetic, plain.potential, plain.constraint, force=damped)
     p = jax.tree.map(jnp.asarray, parameters)
     rod = lambda length, angle: length * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
     inner = rod(p["l1"], p["a"])

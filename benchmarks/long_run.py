@@ -83,7 +83,7 @@ def our_rows(quick: bool) -> list[harness.Row]:
 
 def _diffrax_rows(end: float) -> list[harness.Row]:
     try:
-        import diffrax
+        import diffrax  # pyright: ignore[reportMissingImports]
     except ImportError:
         return []
     from speed_accuracy_peers import swing
