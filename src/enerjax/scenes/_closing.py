@@ -75,7 +75,7 @@ def closed_start(
     try:
         start = start_near(system, told.state, args, t, partly)
     except ValueError as error:
-        name = first_dependent(layout, told.state.q, t, args, rows)
+        name = first_dependent(layout, told.state.q, t, args, rows) if known else None
         if name is None:
             raise
         message = str(error).replace("`System(", "`Scene(")
