@@ -149,9 +149,9 @@ def _follow(system, scheme, start, args, h, steps, t0):
         state, leak, most, okay = carry
         out = ej.step(system, scheme, state, args, h=h, t=t0 + k.astype(float) * h)
         change = system.energy(out.state, args) - system.energy(state, args)
-        work = 0.0 if out.work is None else out.work
-        driven = 0.0 if out.drive_work is None else out.drive_work
-        unexplained = jnp.abs(change - work - driven + out.dissipated)
+        work = 0.0 if out.energies.work is None else out.energies.work
+        driven = 0.0 if out.energies.drive_work is None else out.energies.drive_work
+        unexplained = jnp.abs(change - work - driven + out.energies.dissipated)
         leak, most = jnp.maximum(leak, unexplained), jnp.maximum(most, work)
         return out.state, leak, most, okay & (out.result == ej.RESULTS.successful)
 

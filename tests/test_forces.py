@@ -108,7 +108,40 @@ def test_the_work_of_a_damper_in_a_decaying_step_is_a_sum_of_squares(alpha):
     # Eq. (47e): the velocities fix the jump of the position.
     lag = -(out.state.v[0] - alpha * jumped - (1 - alpha) * v0) / 6
     squares = mean**2 + 3 * lag**2
-    np.testing.assert_allclose(np.asarray(out.work), -args["c"] * h * squares, rtol=1e-13)
+    np.testing.assert_allclose(
+        np.asarray(out.energies.work), -args["c"] * h * squares, rtol=1e-13
+    )
+
+
+def _pushed_and_braked(q, v, t, args):
+    dry = jnp.tanh(1e3 * v) if args["smooth"] is True else v / jnp.abs(v)
+    return args["push"] - args["c"] * v - args["dry"] * dry
+
+
+@pytest.mark.parametrize("smooth", [True, False])
+@pytest.mark.parametrize(
+    "scheme",
+    [
+        ej.EnergyPreserving(),
+        ej.EnergyDecaying(0.5),
+        ej.EnergyConsistent(0.5),
+        ej.Rattle(),
+    ],
+    ids=lambda scheme: type(scheme).__name__,
+)
+def test_what_dampers_take_is_told_apart_from_the_work_of_other_forces(scheme, smooth):
+    system = ej.System(DAMPED.kinetic, DAMPED.potential, force=_pushed_and_braked)
+    args = dict(k=4.0, c=0.8, dry=0.1, push=0.7, smooth=smooth)
+    start = ej.State([1.0], [0.3])
+    run = ej.simulate(system, scheme, start, args, h=0.05, num_steps=4)
+    audit = run.audit
+    # A constant force works along the way, whatever the velocity is; round-off.
+    np.testing.assert_allclose(
+        audit.work + audit.damped,
+        0.7 * np.diff(run.ys.q[:, 0], prepend=run.ys.q[0, 0]),
+        atol=1e-15,
+    )
+    assert np.all(audit.damped[1:] > 0)
 
 
 def push(q, v, t, args):

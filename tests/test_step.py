@@ -28,7 +28,11 @@ def test_a_loop_over_step_is_a_run(scheme):
     def one(carry, _):
         state, warm = carry
         out = ej.step(system, make, state, args, h=H, warm=warm)
-        return (out.state, out.warm), (out.state, out.dissipated, out.newton_iterations)
+        return (out.state, out.warm), (
+            out.state,
+            out.energies.dissipated,
+            out.newton_iterations,
+        )
 
     @jax.jit
     def loop(carry):

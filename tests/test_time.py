@@ -64,8 +64,8 @@ def test_without_force_and_drive_there_is_no_time(scheme):
 
     jaxpr, out = program(system)
     assert not depends(jaxpr, jaxpr.invars[0])
-    assert out.work is None
-    assert out.drive_work is None
+    assert out.energies.work is None
+    assert out.energies.drive_work is None
     # With a drive there is: the test above can fail.
     jaxpr, _ = program(SHAKEN)
     assert depends(jaxpr, jaxpr.invars[0])

@@ -21,6 +21,7 @@ from ._discrete import (
     Gonzalez as Gonzalez,
     MeanValue as MeanValue,
 )
+from ._energies import Energies as Energies
 from ._fast_loops import enable_fast_loops as enable_fast_loops
 from ._identify import (
     Fit as Fit,

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._energies import Energies
 from ._model import AbstractModel
 from ._system import State
 from ._tracing import is_known
@@ -19,10 +20,11 @@ class Audit(eqx.Module):
     - `kinetic`, `potential`, `energy`: shape `(times,)` (energy).
     - `dissipated`: shape `(times,)`, the energy that the scheme removed since the row
       before, by its own identity; 0 in row 0.
-    - `work`, `drive_work`: shape `(times,)`, the work of `force` (of dampers it is
-      negative) and that of `driven` constraints on the system since the row before; 0
-      where the system has none. Joints do no work: their discrete gradient is orthogonal
-      to what they hold.
+    - `work`, `drive_work`: shape `(times,)`, the work of `force` (dampers included) and
+      that of `driven` constraints on the system since the row before; 0 where the system
+      has none. Joints do no work: their discrete gradient is orthogonal to what they hold.
+    - `damped`: shape `(times,)`, what dampers took: the work, with the other sign, of the
+      part of `force` that changes sign with the velocity, `(f(q, v, t) - f(q, -v, t))/2`.
     - `leak`: shape `(times,)`, what this leaves of the change of the energy since the row
       before, `energy[k] = energy[k-1] + work[k] + drive_work[k] - dissipated[k] + leak[k]`:
       round-off, what Newton left, and what a scheme without an energy identity loses on
@@ -38,6 +40,7 @@ class Audit(eqx.Module):
     potential: Float[Array, " times"]
     dissipated: Float[Array, " times"]
     work: Float[Array, " times"]
+    damped: Float[Array, " times"]
     drive_work: Float[Array, " times"]
     momentum: Float[Array, "times ns"]
     constraint: Float[Array, "times nc"]
@@ -59,11 +62,9 @@ class Audit(eqx.Module):
 def audit(
     model: AbstractModel,
     states: State,
-    dissipated: Float[Array, " times"],
-    work: Float[Array, " times"] | None,
-    drive_work: Float[Array, " times"] | None,
+    energies: Energies,
 ) -> Audit:
-    """The audit of states with a leading time axis."""
+    """The audit of states, and of the energies between them, with a leading time axis."""
 
     def at(state: State):
         return (
@@ -76,13 +77,14 @@ def audit(
 
     kinetic, potential, momentum, constraint, rate = jax.vmap(at)(states)
     # Where a row is not a number, none of its entries is.
-    none = 0 * dissipated
+    none = 0 * energies.dissipated
     return Audit(
         kinetic,
         potential,
-        dissipated,
-        none if work is None else work,
-        none if drive_work is None else drive_work,
+        energies.dissipated,
+        none if energies.work is None else energies.work,
+        none if energies.damped is None else energies.damped,
+        none if energies.drive_work is None else energies.drive_work,
         momentum,
         constraint,
         rate,
@@ -100,6 +102,7 @@ def _report(audit: Audit) -> str:
         ("energy, change over the run", _worst(_last(audit.energy) - audit.energy[..., 0])),
         ("  removed by the scheme", total(audit.dissipated)),
         ("  work of forces", total(audit.work)),
+        ("    of these, taken by dampers", total(audit.damped)),
         ("  work of drives", total(audit.drive_work)),
         ("  unaccounted for (sum)", total(audit.leak)),
         ("  unaccounted for (largest row)", largest(audit.leak)),

@@ -97,9 +97,7 @@ def _in_parts(
         State(start.q, start.v, before.end.state.t),
         none.displacement,
         none.multipliers,
-        none.dissipated,
-        none.work,
-        none.drive_work,
+        none.energies,
         before.end.details,
         RESULTS.successful,
         before.end.carried,
@@ -123,15 +121,12 @@ def _timed(state: State, start: State, passed: Scalar) -> State:
 
 def _joined(a: Solved, b: Solved, parts: Scalar) -> Solved:
     """What one part adds to those before it."""
-    add = lambda x, y: jax.tree.map(jnp.add, x, y)
     end = StepEnd(
         b.end.state,
         a.end.displacement + b.end.displacement,
         # The mean force over the step.
         a.end.multipliers + b.end.multipliers / parts,
-        a.end.dissipated + b.end.dissipated,
-        add(a.end.work, b.end.work),
-        add(a.end.drive_work, b.end.drive_work),
+        jax.tree.map(jnp.add, a.end.energies, b.end.energies),
         b.end.details,
         b.end.result,
         b.end.carried,

@@ -12,6 +12,7 @@ from jaxtyping import Array, PyTree
 
 from ._check import check_halvings, prepare
 from ._divided import solve_or_divide
+from ._energies import Energies
 from ._linear import largest
 from ._model import AbstractModel, make_model
 from ._newton import Newton
@@ -44,9 +45,8 @@ class StepOutput(eqx.Module):
     - `state`: at the end of the step; meaningless if the step failed.
     - `multipliers`: `lambda` of the step, `(nc,)`, of joints, driven constraints and
       relations between coordinates, in this order.
-    - `dissipated`: energy that the scheme removed, by its own identity.
-    - `work`, `drive_work`: energy that `force` and `driven` constraints brought in; `None`
-      for a system that has none.
+    - `energies`: what the scheme removed, and what `force` and `driven` constraints
+      brought in.
     - `details`: what the scheme reports of its own, or `None`.
     - `newton_iterations`: over all solves of the step.
     - `residual`: of the step equations, see `Statistics`.
@@ -57,9 +57,7 @@ class StepOutput(eqx.Module):
 
     state: State
     multipliers: Multipliers
-    dissipated: Scalar
-    work: Scalar | None
-    drive_work: Scalar | None
+    energies: Energies
     details: PyTree[Any]
     newton_iterations: Count
     residual: Scalar
@@ -113,9 +111,8 @@ def advance(
             max_halvings,
         )
         end = solved.end
-        energies = (end.dissipated, end.work, end.drive_work)
         costs = (solved.iterations, solved.residual, halvings)
-        reported = (end.multipliers, energies, end.details, costs, solved.result)
+        reported = (end.multipliers, end.energies, end.details, costs, solved.result)
         q, rest = _sum_and_rest(state.q, end.displacement + rest)
         state = State(q, end.state.v, end.state.t)
         return (state, rest), (length, reported, solved.memory)
@@ -125,14 +122,11 @@ def advance(
     (state, rest), (lengths, reported, memory) = jax.lax.scan(stage, begin, inputs)
     multipliers, energies, details, costs, results = reported
     iterations, residuals, halvings = costs
-    dissipated, work, drive_work = jax.tree.map(jnp.sum, energies)
     return StepOutput(
         state,
         # The mean force over the step: stages count by their length, backwards ones too.
         lengths @ multipliers,
-        dissipated,
-        work,
-        drive_work,
+        jax.tree.map(jnp.sum, energies),
         jax.tree.map(lambda x: x[-1], details),
         jnp.sum(iterations),
         largest(residuals),

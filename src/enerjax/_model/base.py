@@ -209,6 +209,10 @@ class AbstractModel(eqx.Module):
         assert t is not None
         return self.system.force(q, v, t, self.args)
 
+    def damping(self, q: Coordinates, v: Velocities, t: Time) -> Velocities:
+        """The part of `f` that changes sign with the velocity."""
+        return 0.5 * (self.force(q, v, t) - self.force(q, -v, t))
+
     def fill(self, count: int, dtype: Any) -> Float[Array, " count"] | None:
         """What makes equations for `count` scaled multipliers regular, if need be."""
         if not self.system.redundant:

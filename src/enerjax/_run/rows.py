@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._energies import Energies
 from .._model import AbstractModel
 from .._system import State
 from .._types import Count, Flag, Multipliers, Scalar, Times
@@ -19,14 +20,14 @@ class Step(eqx.Module):
 
     - `reached`: state and multipliers at the end; `None` where no rows are made of them.
     - `details`: what the scheme reports of its own.
-    - `energies`: dissipated, work, work of drives; zero for a step that was rejected.
+    - `energies`: zero for a step that was rejected.
     - `costs`: iterations, residual and halvings.
     - `passed`: the part of the whole time that has passed at its end.
     """
 
     reached: PyTree[Any]
     details: PyTree[Any]
-    energies: PyTree[Float[Array, " steps"]]
+    energies: Energies
     passed: Float[Array, " steps"]
     accepted: Bool[Array, " steps"]
     costs: tuple[Array, Array, Array]
@@ -49,14 +50,14 @@ class Run(eqx.Module):
 
 
 # Times, states, multipliers, details, and energies since the row before.
-Rows: TypeAlias = tuple[Times, State, Array, PyTree[Any], PyTree[Any]]
+Rows: TypeAlias = tuple[Times, State, Array, PyTree[Any], Energies]
 
 
 def _behind(first: PyTree[Any], rest: PyTree[Any]) -> PyTree[Any]:
     return jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), first, rest)
 
 
-def _zeros(run: Run) -> PyTree[Any]:
+def _zeros(run: Run) -> Energies:
     return jax.tree.map(lambda x: jnp.zeros((), x.dtype), run.steps.energies)
 
 

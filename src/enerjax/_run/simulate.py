@@ -174,10 +174,9 @@ def _run(
         state, memory = select(good, (reached, out.warm), (carry.state, carry.warm))
         completed = carry.completed + good.astype(carry.completed.dtype)
         reported = (out.multipliers, out.details)
-        energies = (out.dissipated, out.work, out.drive_work)
         return _Carry(state, memory, result, completed), (
             reported,
-            jax.tree.map(lambda x: jnp.where(good, x, 0), energies),
+            jax.tree.map(lambda x: jnp.where(good, x, 0), out.energies),
             jax.tree.map(
                 lambda x: jnp.where(skip, 0, x),
                 (out.newton_iterations, out.residual, out.halvings),
@@ -213,7 +212,7 @@ def _run(
         jax.vmap(model.leave)(states),
         multipliers,
         details,
-        audit(model, timed(states, saved), *energies),
+        audit(model, timed(states, saved), energies),
         Statistics(iterations, residuals, halvings, end.completed),
         model.leave(end.state),
         end.result,

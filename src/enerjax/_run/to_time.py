@@ -139,8 +139,7 @@ def _run(
             carry.attempts + count(live),
             multipliers,
         )
-        energies = out.dissipated, out.work, out.drive_work
-        energies = jax.tree.map(lambda x: jnp.where(good, x, 0), energies)
+        energies = jax.tree.map(lambda x: jnp.where(good, x, 0), out.energies)
         states = None if rows is None else (state, multipliers)
         costs = out.newton_iterations, out.residual, out.halvings
         costs = jax.tree.map(lambda x: jnp.where(live, x, 0), costs)
@@ -179,7 +178,7 @@ def _run(
         jax.vmap(model.leave)(states),
         multipliers,
         details,
-        audit(model, jax.vmap(timed)(states, passed), *energies),
+        audit(model, jax.vmap(timed)(states, passed), energies),
         Statistics(iterations, residuals, halvings, end.completed, rejected),
         model.leave(end.state),
         result,

@@ -1,12 +1,16 @@
 """What the schemes that are here for comparison have in common."""
 
+from collections.abc import Callable
+
+import equinox as eqx
 import jax
 
 from .._discrete import ChainRule
+from .._energies import Energies
 from .._model import AbstractModel, Increment, SeparableModel
 from .._system import State
 from .._types import Coordinates, Multipliers, Scalar
-from .base import Formulation, StepProblem
+from .base import Formulation, Law, StepProblem
 
 
 def plain_problem(
@@ -41,16 +45,20 @@ def reaction_force(
     return transpose(multipliers)[0]
 
 
-def measured_loss(
-    problem: StepProblem, end: State, work: Scalar | None, drive_work: Scalar | None
-) -> Scalar:
-    """The energy that is missing at the end, which no identity of the scheme explains."""
+def measured_account(
+    problem: StepProblem,
+    end: State,
+    work: Callable[[Law], Scalar],
+    drive_work: Scalar | None,
+) -> Energies:
+    """As removed by the scheme the energy that is missing, which no identity explains."""
     model, start = problem.model, problem.start
     energy = lambda state: model.kinetic(state) + model.potential(state)
-    loss = energy(start) - energy(end)
-    for supplied in (work, drive_work):
+    account = problem.account(energy(start) - energy(end), work, drive_work)
+    loss = account.dissipated
+    for supplied in (account.work, drive_work):
         loss = loss if supplied is None else loss + supplied
-    return loss
+    return eqx.tree_at(lambda account: account.dissipated, account, loss)
 
 
 def balance_rows(

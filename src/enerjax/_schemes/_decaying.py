@@ -1,5 +1,7 @@
 """What the discontinuous schemes have in common."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +11,7 @@ from .._model import Drive, Increment, SeparableModel
 from .._system import State
 from .._tracing import is_known
 from .._types import Coordinates, Multipliers, Real, Scalar, Velocities
-from .base import StepProblem
+from .base import Law, StepProblem
 
 
 class JumpAndEnd(eqx.Module):
@@ -93,13 +95,12 @@ def jump_drive(
 
 
 class Loads(eqx.Module):
-    """`h L^T f` over `zj -> z1`, over `z0 -> zj`, at `z0` and at `zj`; and their work."""
+    """`h L^T f` over `zj -> z1`, over `z0 -> zj`, at `z0` and at `zj`."""
 
     after: Coordinates | None = None
     before: Coordinates | None = None
     start: Coordinates | None = None
     jump: Coordinates | None = None
-    work: Scalar | None = None
 
 
 def jump_loads(
@@ -113,21 +114,45 @@ def jump_loads(
 
         W = -c h (|(q1 - q0)/h|^2 + 3 |(qj - q0)/h|^2)
     """
-    model, start = problem.model, problem.start
+    model = problem.model
     if model.system.force is None:
         return Loads()
+    return _loads(model.force, alpha, z, problem, jump, end)
+
+
+def _loads(
+    law: Law,
+    alpha: Scalar,
+    z: JumpAndEnd,
+    problem: StepProblem,
+    jump: State,
+    end: State,
+) -> Loads:
+    model, start = problem.model, problem.start
     v0, vj = model.velocity(start), model.velocity(jump)
     lag = model.push(start.q, problem.at(z.end), z.jump.rate)
     half = 0.5 * alpha.astype(v0.dtype)
     mean = problem.velocity(z.end) + 3 * lag - half * (vj - v0)
-    after = problem.load(jump, end, z.end, problem.velocity(z.end))
-    before = problem.load(start, jump, z.end, mean)
-    at_start = problem.load(start, start, z.end, v0)
-    at_jump = problem.load(jump, jump, z.end, vj)
-    # The last part is the work of `alpha/6 (F_j - F_0)`.
-    over_jump = before + half * (at_jump - at_start)
-    work = after @ (z.end.rate - z.jump.rate) + over_jump @ z.jump.rate
-    return Loads(after, before, at_start, at_jump, work)
+    after = problem.load(law, jump, end, z.end, problem.velocity(z.end))
+    before = problem.load(law, start, jump, z.end, mean)
+    at_start = problem.load(law, start, start, z.end, v0)
+    at_jump = problem.load(law, jump, jump, z.end, vj)
+    return Loads(after, before, at_start, at_jump)
+
+
+def jump_work(
+    alpha: Scalar, z: JumpAndEnd, problem: StepProblem, jump: State, end: State
+) -> Callable[[Law], Scalar]:
+    """The work that a force does in a discontinuous step."""
+
+    def work(law: Law) -> Scalar:
+        loads = _loads(law, alpha, z, problem, jump, end)
+        # The last part is the work of `alpha/6 (F_j - F_0)`.
+        share = 0.5 * alpha.astype(loads.before.dtype)
+        over_jump = loads.before + share * (loads.jump - loads.start)
+        return loads.after @ (z.end.rate - z.jump.rate) + over_jump @ z.jump.rate
+
+    return work
 
 
 def jump_energy(problem: StepProblem, jump: State) -> tuple[Scalar, Scalar]:

@@ -1,4 +1,5 @@
 import abc
+from collections.abc import Callable
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 import equinox as eqx
@@ -7,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from .._discrete import AbstractDerivative
+from .._energies import Energies
 from .._model import AbstractModel, Drive, Increment, Time
 from .._results import RESULTS
 from .._system import State
@@ -22,6 +24,8 @@ from .._types import (
 # The levels at which joints are held: positions and velocities, stabilised as by Gear,
 # Gupta and Leimkuhler; or positions only.
 Formulation: TypeAlias = Literal["ggl", "index3"]
+# A force as a function of coordinates, velocities and time: all of it, or a part.
+Law: TypeAlias = Callable[[Coordinates, Velocities, Time], Velocities]
 Z = TypeVar("Z")
 P = TypeVar("P")
 
@@ -74,14 +78,30 @@ class StepProblem(eqx.Module):
         """`h Lm^T f` in the middle of the step; `None` for a system without forces."""
         if self.model.system.force is None:
             return None
-        return self.load(self.start, b, end, self.velocity(end))
+        return self.load(self.model.force, self.start, b, end, self.velocity(end))
 
-    def load(self, a: State, b: State, end: Increment, velocity: Velocities) -> Coordinates:
+    def load(
+        self, law: Law, a: State, b: State, end: Increment, velocity: Velocities
+    ) -> Coordinates:
         """`h Lm^T f` in the middle of `a -> b`, with `Lm` that of the step to `end`."""
         assert a.t is not None
         assert b.t is not None
-        force = self.model.force(0.5 * (a.q + b.q), velocity, 0.5 * (a.t + b.t))
+        force = law(0.5 * (a.q + b.q), velocity, 0.5 * (a.t + b.t))
         return self.h * self.model.pull(self.start.q, self.at(end), force)
+
+    def step_work(self, b: State, end: Increment) -> Callable[[Law], Scalar]:
+        """The work that a force does in the middle of the step."""
+        velocity = self.velocity(end)
+        return lambda law: self.load(law, self.start, b, end, velocity) @ end.rate
+
+    def account(
+        self, dissipated: Scalar, work: Callable[[Law], Scalar], drive_work: Scalar | None
+    ) -> Energies:
+        """The energies of a step, given the work that a force does in it."""
+        if self.model.system.force is None:
+            return Energies(dissipated, None, None, drive_work)
+        total, damping = work(self.model.force), work(self.model.damping)
+        return Energies(dissipated, total, -damping, drive_work)
 
     def joint_rate(self, state: State) -> JointMultipliers:
         """`psi(q, v)` where the formulation holds it, else no rows."""
@@ -118,9 +138,7 @@ class StepEnd(eqx.Module):
     - `state`: at the end of the step.
     - `displacement`: of the configuration over the step, not yet rounded to that of `q`.
     - `multipliers`: `lambda` of the step, joints first (energy per constraint unit).
-    - `dissipated`: the energy that the scheme removed, by its own identity.
-    - `work`, `drive_work`: of the forces and of the driven constraints; `None` for a
-      system that has none.
+    - `energies`: where the energy went.
     - `details`: what the scheme reports of its own, or `None`.
     - `result`: a failure that the scheme itself can see.
     - `carried`: what a scheme with a memory hands to its next step; of others `None`.
@@ -129,9 +147,7 @@ class StepEnd(eqx.Module):
     state: State
     displacement: Coordinates
     multipliers: Multipliers
-    dissipated: Scalar
-    work: Scalar | None
-    drive_work: Scalar | None
+    energies: Energies
     details: PyTree[Any]
     result: RESULTS
     carried: PyTree[Any] = None

@@ -161,14 +161,12 @@ class EnergyConsistent(AbstractSingleSolve[_Unknowns, Frozen]):
         dv = self._velocity(problem, end.v - step.start.v)
         jump_q = -h / 6 * (dv - alpha * jump_v)
         size = jump_q @ (problem.stiffness @ jump_q) + jump_v @ (problem.inertia @ jump_v)
-        load = step.step_load(end, z)
+        work, drive_work = step.step_work(end, z), self._drive_work(z, problem, end)
         return StepEnd(
             end,
             h * z.rate,
             z.impulse / h,
-            0.5 * alpha * size,
-            None if load is None else load @ z.rate,
-            self._drive_work(z, problem, end),
+            step.account(0.5 * alpha * size, work, drive_work),
             None,
             RESULTS.successful,
         )

@@ -11,6 +11,7 @@ from ._decaying import (
     jump_drive,
     jump_energy,
     jump_loads,
+    jump_work,
     JumpAndEnd,
     predict_jump_and_end,
     split_velocities,
@@ -114,14 +115,14 @@ class EnergyDecaying(AbstractSingleSolve[JumpAndEnd, StepProblem]):
     def finish(self, z: JumpAndEnd, problem: StepProblem) -> StepEnd:
         jump, end = self._nodes(z, problem)
         kinetic, potential = jump_energy(problem, jump)
-        loads = jump_loads(self.alpha, z, problem, jump, end)
+        dissipated = self.alpha.astype(kinetic.dtype) * (kinetic + potential)
+        work = jump_work(self.alpha, z, problem, jump, end)
+        drive_work = problem.drive_work(jump, end, z.end)
         return StepEnd(
             end,
             problem.h * z.end.rate,
             z.end.impulse / problem.h,
-            self.alpha.astype(kinetic.dtype) * (kinetic + potential),
-            loads.work,
-            problem.drive_work(jump, end, z.end),
+            problem.account(dissipated, work, drive_work),
             None,
             RESULTS.successful,
         )

@@ -71,14 +71,13 @@ class EnergyPreserving(AbstractSingleSolve[Increment, StepProblem]):
 
     def finish(self, z: Increment, problem: StepProblem) -> StepEnd:
         end = self._end(z, problem)
-        load = problem.step_load(end, z)
+        drive_work = problem.drive_work(problem.start, end, z)
+        nothing = jnp.zeros_like(problem.h)
         return StepEnd(
             end,
             problem.h * z.rate,
             z.impulse / problem.h,
-            jnp.zeros_like(problem.h),
-            None if load is None else load @ z.rate,
-            problem.drive_work(problem.start, end, z),
+            problem.account(nothing, problem.step_work(end, z), drive_work),
             None,
             RESULTS.successful,
         )

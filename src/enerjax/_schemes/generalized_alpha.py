@@ -10,7 +10,7 @@ from .._tracing import is_known
 from .._types import Multipliers, Real, Scalar, Velocities
 from ._baseline import (
     balance_rows,
-    measured_loss,
+    measured_account,
     model_of,
     plain_problem,
     reaction_force,
@@ -182,22 +182,19 @@ class GeneralizedAlpha(AbstractCarryingSolve[Increment, _AlphaProblem]):
         assert before is not None
         model, half = model_of(step), 0.5 * step.h
         end, after = self._end(z, problem)
-        work = drive_work = None
-        if model.system.force is not None:
-            power = lambda x: model.force(x.q, x.v, x.t) @ x.v
-            work = half * (power(step.start) + power(end))
+        powers = lambda law: [law(x.q, x.v, x.t) @ x.v for x in (step.start, end)]
+        work = lambda law: half * sum(powers(law))
+        drive_work = None
         if model.system.driven is not None:
             # The reactions are what keeps the balance; those of joints at rest do no work.
             power = lambda x, vdot: (model.inertia @ vdot + model.slope(x)) @ x.v
-            powers = power(step.start, before.acceleration) + power(end, after.acceleration)
-            drive_work = half * powers
+            first, last = before.acceleration, after.acceleration
+            drive_work = half * (power(step.start, first) + power(end, last))
         return StepEnd(
             end,
             step.h * z.rate,
             z.impulse / step.h,
-            measured_loss(step, end, work, drive_work),
-            work,
-            drive_work,
+            measured_account(step, end, work, drive_work),
             None,
             RESULTS.successful,
             after,

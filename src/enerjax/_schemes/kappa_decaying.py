@@ -13,6 +13,7 @@ from ._decaying import (
     jump_drive,
     jump_energy,
     jump_loads,
+    jump_work,
     JumpAndEnd,
     predict_jump_and_end,
     split_velocities,
@@ -117,17 +118,17 @@ class KappaDecaying(AbstractSingleSolve[_Unknowns, StepProblem]):
     def finish(self, z: _Unknowns, problem: StepProblem) -> StepEnd:
         jump, end = self._nodes(z, problem)
         kinetic, potential = jump_energy(problem, jump)
-        loads = jump_loads(self.alpha, z.nodes, problem, jump, end)
         kappa = _kappa(z)
+        dissipated = self.alpha.astype(kappa.dtype) * (kappa * kinetic + potential)
+        work = jump_work(self.alpha, z.nodes, problem, jump, end)
+        drive_work = problem.drive_work(jump, end, _position_level(z.nodes.end))
         # A kappa without value comes from an iterate that broke down for other reasons.
         bounded = ((kappa > 0) & (kappa < 2)) | ~jnp.isfinite(kappa)
         return StepEnd(
             end,
             problem.h * z.nodes.end.rate,
             z.nodes.end.impulse / problem.h,
-            self.alpha.astype(kappa.dtype) * (kappa * kinetic + potential),
-            loads.work,
-            problem.drive_work(jump, end, _position_level(z.nodes.end)),
+            problem.account(dissipated, work, drive_work),
             kappa,
             RESULTS.where(bounded, RESULTS.successful, RESULTS.kappa_out_of_range),
         )

@@ -1,12 +1,10 @@
-import jax.numpy as jnp
-
 from .._model import AbstractModel, Increment
 from .._results import RESULTS
 from .._system import State
 from .._types import Coordinates, Multipliers, Scalar, Velocities
 from ._baseline import (
     balance_rows,
-    measured_loss,
+    measured_account,
     model_of,
     plain_problem,
     reaction_force,
@@ -69,14 +67,15 @@ class Rattle(AbstractSingleSolve[Increment, StepProblem]):
 
     def finish(self, z: Increment, problem: StepProblem) -> StepEnd:
         end = self._end(z, problem)
-        work, drive_work = self._work(z, problem, end), self._drive_work(z, problem, end)
+        # Of the forces of both ends, over the way of the step.
+        at_ends = lambda law: [law(x.q, z.rate, x.t) for x in (problem.start, end)]
+        work = lambda law: 0.5 * problem.h * sum(at_ends(law)) @ z.rate
+        drive_work = self._drive_work(z, problem, end)
         return StepEnd(
             end,
             problem.h * z.rate,
             0.5 * (z.impulse + z.velocity_impulse) / problem.h,
-            measured_loss(problem, end, work, drive_work),
-            work,
-            drive_work,
+            measured_account(problem, end, work, drive_work),
             None,
             RESULTS.successful,
         )
@@ -99,14 +98,6 @@ class Rattle(AbstractSingleSolve[Increment, StepProblem]):
         model = problem.model
         slope = model.slope(State(q, middle, t))
         return problem.h * slope + reaction_force(model, q, t, impulse)
-
-    def _work(self, z: Increment, problem: StepProblem, end: State) -> Scalar | None:
-        """Of the forces of both ends, over the way of the step."""
-        model, start = problem.model, problem.start
-        if model.system.force is None:
-            return None
-        forces = [model.force(x.q, z.rate, x.t) for x in (start, end)]
-        return 0.5 * problem.h * jnp.sum(jnp.stack(forces), axis=0) @ z.rate
 
     def _drive_work(self, z: Increment, problem: StepProblem, end: State) -> Scalar | None:
         """That of all reactions: those of joints that do not move do none."""
