@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from extremes_runs import LAW, REPORTED, RIGHT, WRONG
+from extremes_runs import LAW, REPORTED, RIGHT
 
 import enerjax as ej
 
@@ -33,15 +33,9 @@ def test_a_linear_spring_is_right_at_every_step():
 
 
 def test_a_stiff_quartic_spring_is_right_or_says_that_it_failed():
-    rows = [row for row in steps() if row.case == "quartic spring" and row.x <= 100]
+    rows = [row for row in steps() if row.case == "quartic spring"]
     assert {row.verdict for row in rows} <= {RIGHT, LAW, REPORTED}
     assert {row.verdict for row in rows if row.x <= 1} == {RIGHT, LAW}
-
-
-@pytest.mark.xfail(strict=True, reason="the scale of a step is its force at the start")
-def test_a_quartic_spring_far_too_stiff_for_the_step_is_not_called_a_success():
-    rows = [row for row in steps() if row.case == "quartic spring" and row.x > 100]
-    assert WRONG not in {row.verdict for row in rows}
 
 
 def test_motion_that_dies_out_away_from_zero_stays_at_rest():

@@ -59,6 +59,7 @@ class Start(eqx.Module):
     - `skip`: return the guess without an iteration.
     - `fill`: for each unknown, what is added to the diagonal of a Jacobian that may be
       singular; see `find_root`.
+    - `least`: where all unknowns are smaller, it is by round-off.
     """
 
     guess: PyTree[Array]
@@ -66,6 +67,7 @@ class Start(eqx.Module):
     factors: AbstractFactors | None
     skip: Flag
     fill: PyTree[Array] | None
+    least: Scalar
 
 
 class _Iterate(eqx.Module):
@@ -120,8 +122,10 @@ def newton_iterations(
         correction = before.factors.solve(value)
         x = before.x - correction
         # Each unknown against itself: one scale for all would hide a light, slow body
-        # beside a heavy, fast one. The floor is for unknowns that pass through zero.
-        size = largest(correction / (jnp.abs(x) + eps**0.125))
+        # beside a heavy, fast one. The floor is for unknowns that pass through zero; where
+        # all of them are small, they had been taken for larger than they are.
+        floor = eps**0.125 * jnp.clip(largest(x), start.least, 1.0)
+        size = largest(correction / (jnp.abs(x) + floor))
         defect, contraction = max_norm(value), size / before.size
         small = size <= eps**0.25
         shrinks = contraction < _SHRINKS

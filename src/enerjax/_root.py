@@ -142,6 +142,7 @@ def find_root(
     factors: AbstractFactors | None = None,
     skip: Flag | bool = False,
     fill: PyTree[Array] | None = None,
+    least: Scalar | float = 1.0,
 ) -> Root:
     """The root of `fn(y, args)`. Never raises.
 
@@ -153,6 +154,8 @@ def find_root(
     `fill`, like the guess, is for equations that do not determine some of the unknowns,
     and do not ask for them either: small numbers that are added to the diagonal of the
     Jacobian, and make it regular. Such unknowns then stay what they are in the guess.
+    Unknowns that turn out all smaller than one are resolved by their own size, down to
+    `least`.
     """
     flat, _ = ravel_pytree(guess)
     start = Start(
@@ -161,6 +164,7 @@ def find_root(
         kept_factors(flat.size, flat.dtype) if factors is None else factors,
         jnp.asarray(skip),
         fill,
+        jnp.asarray(least, flat.dtype),
     )
     start = jax.lax.stop_gradient(start)
     # What is closed over becomes an input: functions in `args` may hold traced numbers.

@@ -18,8 +18,12 @@ _BEYOND = 0.01
 
 def scales_like(
     z: PyTree[Any], model: AbstractModel, start: State, h: Scalar
-) -> tuple[PyTree[Any], PyTree[Any]]:
-    """The sizes of the unknowns in `z`, and of the rows that stand in their places."""
+) -> tuple[PyTree[Any], PyTree[Any], Scalar]:
+    """The sizes of the unknowns in `z`, and of the rows that stand in their places.
+
+    Unknowns can turn out smaller: a stiff spring stops a body long before its force has
+    acted for all of a step. The last value is the part down to which it is not round-off.
+    """
     scales = model.scales
     root = jnp.sqrt(model.energy_scale(start, h))
     forces = jnp.abs(h) * force_size(model, start)
@@ -28,8 +32,9 @@ def scales_like(
     rounding = jnp.maximum(
         forces / scales.coordinate, scales.coordinate * jnp.abs(start.q / h)
     )
-    least = jnp.finfo(h.dtype).eps ** 0.5 * jnp.linalg.norm(rounding)
-    unit = jnp.maximum(root, jax.lax.stop_gradient(least))
+    small = jnp.finfo(h.dtype).eps ** 0.5
+    least = small * jax.lax.stop_gradient(jnp.linalg.norm(rounding))
+    unit = jnp.maximum(root, least)
     is_increment = lambda x: isinstance(x, Increment)
 
     def unknown(x):
@@ -53,4 +58,5 @@ def scales_like(
         rate = (root / scales.coordinate)[: x.momentum.size]
         return Increment(momentum, rate, position[: x.impulse.size], root * joint)
 
-    return tuple(jax.tree.map(f, z, is_leaf=is_increment) for f in (unknown, row))  # pyright: ignore
+    unknowns, rows = (jax.tree.map(f, z, is_leaf=is_increment) for f in (unknown, row))
+    return unknowns, rows, jnp.clip(least / root, small, 1.0)

@@ -109,7 +109,7 @@ def solve(
     """A step of length `h` of a scheme; with `skip` it costs no iteration."""
     problem = _problem(scheme, model, start, h, memory.carried)
     flight = _free_flight(scheme, problem, model, start)
-    unknown_scale, row_scale = scales_like(flight, model, start, h)
+    unknown_scale, row_scale, least = scales_like(flight, model, start, h)
 
     def scaled(x, inputs):
         scheme, problem, unknown_scale, row_scale = inputs
@@ -135,6 +135,7 @@ def solve(
         # flight without force starts on the near side.
         second_guess=jax.tree.map(jnp.divide, flight, unknown_scale),
         fill=_fill(model, unknown_scale, row_scale),
+        least=least,
     )
     root = find(guess=guess, factors=memory.factors, skip=skip)
     if model.system.redundant:
