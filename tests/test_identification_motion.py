@@ -168,7 +168,7 @@ def test_windows_find_what_one_run_finds():
             swing(parameters, start, 2.0)
         )
 
-    residuals = ej.multiple_shooting(window)
+    residuals = ej.MultipleShooting(window, 1e3)
     pieces = data[:64].reshape(4, 16)
     starts = np.stack([pieces[:, 0], (pieces[:, 1] - pieces[:, 0]) * 8], axis=1)
     # From so far off a single run ends elsewhere; this one has the first program.
@@ -230,7 +230,7 @@ def test_a_long_chaotic_run_through_constraints():
 
     following = np.append(turns[5::5], turns[-1:], axis=0)
     pieces = {"q": data.reshape(24, 5, 4), "next": following}
-    residuals = ej.multiple_shooting(window, continuity=1e3)
+    residuals = ej.MultipleShooting(window, 1e3)
     guess = {"parameters": {"m2": 0.8, "g": 9.0}, "starts": starts}
     fit = ej.fit(residuals, guess, pieces)
     found, errors = fit.parameters["parameters"], fit.standard_errors["parameters"]

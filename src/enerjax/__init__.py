@@ -26,7 +26,7 @@ from ._fast_loops import enable_fast_loops as enable_fast_loops
 from ._identify import (
     Fit as Fit,
     fit as fit,
-    multiple_shooting as multiple_shooting,
+    MultipleShooting as MultipleShooting,
 )
 from ._initial import (
     consistent_start as consistent_start,

@@ -48,7 +48,7 @@ def fit(
         fits.smallest("cost").values
 
     Runs that are long against the time in which the motion forgets its start (chaos) have
-    a cost of many minima: see `multiple_shooting`.
+    a cost of many minima: see `MultipleShooting`.
 
     **Arguments:**
 
