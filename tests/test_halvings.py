@@ -116,3 +116,32 @@ def test_bad_halvings_are_refused():
     for bad in (-1, 2.0, True, 21):
         with pytest.raises(ValueError, match="max_halvings"):
             run(0.1, max_halvings=bad)  # pyright: ignore[reportArgumentType]
+
+
+def test_newton_is_damped_where_a_force_saturates():
+    """Undamped, no first step of these is made: each correction is larger than the last."""
+    softening = lambda q, args: args["k"] * jnp.sqrt(1 + q @ q)
+    system = ej.System(lambda v, args: 0.5 * v @ v, softening)
+
+    def run(q, k):
+        start = ej.State(q[None], jnp.array([0.7]))
+        return ej.simulate(
+            system,
+            ej.EnergyPreserving(),
+            start,
+            {"k": k},
+            h=1.0,
+            num_steps=20,
+            throw=False,
+            max_halvings=0,
+        )
+
+    stiffness = jnp.array([100.0, 1e4])
+    runs = jax.vmap(lambda k: jax.vmap(run, (0, None))(jnp.array([0.9, 1.5, 6.0]), k))(
+        stiffness
+    )
+    good = np.asarray(runs.result == ej.RESULTS.successful)
+    assert np.mean(good) >= 0.5
+    # Round-off, in energies that are as large as the stiffness.
+    leak = np.max(np.abs(runs.audit.leak), axis=-1) / stiffness[:, None]
+    assert np.max(leak[good]) <= 1e-13

@@ -21,7 +21,9 @@ class Newton(eqx.Module):
 
     One Jacobian serves several corrections, with an approximate inverse that is improved
     from that of the step before. It is renewed where the corrections `c_k` would shrink by
-    less than three; such a correction is not made. Stops after a correction whose error,
+    less than three; such a correction is not made. Where the first one after that of a new
+    Jacobian is larger still, that went too far: it is halved, up to seven times (P.
+    Deuflhard's natural monotonicity test). Stops after a correction whose error,
     predicted to be `c_k max(c_k / c_{k-1}, c_{k-1})`, is of round-off size, or which was
     computed from a residual that is, or where corrections that did shrink no longer do:
     coordinates far from the origin are too coarse for more. An iteration that breaks
@@ -73,6 +75,9 @@ class Start(eqx.Module):
 class _Iterate(eqx.Module):
     x: Float[Array, " n"]
     factors: AbstractFactors
+    # The last correction made with a Jacobian of its own, and the part of it that was.
+    step: Float[Array, " n"]
+    part: Scalar
     # Size of the last correction, infinite if there was none, and what it had left of the
     # one before, zero unless both were made with the same Jacobian.
     size: Scalar
@@ -98,6 +103,8 @@ _PATIENCE = 12
 # energy would drift.
 _SHRINKS = 0.3
 _STALLS = 4
+# A correction is halved until it takes no part smaller than this.
+_LEAST_PART = 0.01
 
 
 def newton_iterations(
@@ -148,29 +155,51 @@ def newton_iterations(
         ends = ends | (stalled & ((defect <= eps**0.75) | again_and_again))
         done = (converged | is_root | ends) & jnp.isfinite(size)
         kept = fresh | shrinks | is_root
+        # The first correction after one with a Jacobian of its own is what that has left
+        # over: it went too far where that is more than there was.
+        first = ~fresh & (before.contraction == 0)
+        less = contraction <= 1 - 0.25 * before.part
+        back = first & ~less & ~done & (before.part > _LEAST_PART)
+        part = jnp.where(back, 0.5 * before.part, jnp.ones_like(before.part))
         broken = fresh & ~jnp.isfinite(size)
-        lost = broken | (~kept & (before.jacobians == _PATIENCE))
+        lost = broken | (~kept & ~back & (before.jacobians == _PATIENCE))
         again = lost & ~done & (before.jacobians <= _PATIENCE)
+        stays = jnp.where(back, before.x + part * before.step, before.x)
         return _Iterate(
-            jnp.where(again, second, jnp.where(kept, x, before.x)),
+            jnp.where(again, second, jnp.where(kept, x, stays)),
             before.factors,
+            jnp.where(fresh, correction, before.step),
+            part,
             jnp.where(again, jnp.inf, jnp.where(kept, size, before.size)),
-            jnp.where(fresh | again, 0, contraction),
-            before.corrections + kept.astype(before.corrections.dtype),
+            jnp.where(fresh | again | back, 0, contraction),
+            before.corrections + (kept | back).astype(before.corrections.dtype),
             jnp.where(again, _PATIENCE + 1, before.jacobians),
             stalls,
             defect,
             jnp.zeros_like(fresh),
-            ~kept | again,
+            (~kept & ~back) | again,
             done,
             broken & ~again,
         )
 
-    infinite, zero = jnp.asarray(jnp.inf, x0.dtype), jnp.zeros((), x0.dtype)
+    zero, one, infinite = (jnp.asarray(x, x0.dtype) for x in (0.0, 1.0, jnp.inf))
     none, no = jnp.array(0), jnp.array(False)
     factors, yes = residual.first_factors(start.factors, x0), jnp.array(True)
     first = _Iterate(
-        x0, factors, infinite, zero, none, none, none, zero, no, yes, start.skip, no
+        x0,
+        factors,
+        jnp.zeros_like(x0),
+        one,
+        infinite,
+        zero,
+        none,
+        none,
+        none,
+        zero,
+        no,
+        yes,
+        start.skip,
+        no,
     )
     unfinished = lambda c: (
         ~(c.done | c.broken) & ~(c.stale & (c.jacobians >= max_jacobians))
