@@ -150,14 +150,14 @@ def rest_rows(quick: bool) -> Iterator[Row]:
 
 
 def whip_rows(quick: bool) -> Iterator[Row]:
-    links, steps = (16, 1500) if quick else (64, 1500)
+    links, steps = (16, 2000) if quick else (64, 2000)
     schemes: dict[str, ej.AbstractScheme] = {"EnergyPreserving()": ej.EnergyPreserving()}
     if not quick:
         schemes["EnergyConsistent(0.5)"] = ej.EnergyConsistent(0.5)
     problem = _plain(ej.problems.chain(links))
     for name, scheme in schemes.items():
         solution = run(problem, scheme, 1e-3, steps)
-        place = ("whip", f"{links} links", name, "h = 1e-3 to 1.5 s", float(links))
+        place = ("whip", f"{links} links", name, "h = 1e-3 to 2 s", float(links))
         yield judge(place, solution)
 
 

@@ -82,6 +82,24 @@ def step_rows(quick: bool) -> Iterator[Row]:
                 # Truncation in 1/(h omega).
                 yield judge(place, solution, error_of, 20 / x)
             yield _quartic_row(name, scheme, x)
+    yield from _mechanism_rows(quick)
+
+
+def _mechanism_rows(quick: bool) -> Iterator[Row]:
+    """Steps from far below to far above the period of the fastest motion."""
+    cases = {
+        # Spins with 150 rad/s.
+        "heavy top": (ej.problems.heavy_top_directors(), 150.0),
+        # The transverse waves of a taut chain: about twice the square root of its length
+        # in links over the length of one, times g.
+        "chain, 8 links": (ej.problems.chain(8), 2.0 * np.sqrt(9.81 * 64)),
+    }
+    places = [1e-4, 1e-1] if quick else 10.0 ** np.arange(-6, 5)
+    for case, (problem, omega) in cases.items():
+        for name, scheme in alphas(0.0, 0.5).items():
+            for x in map(float, places):
+                place = ("step", case, name, f"h omega = {x:g}", x)
+                yield judge(place, run(problem, scheme, x / omega, STEPS))
 
 
 def _quartic_row(name: str, scheme: ej.AbstractScheme, x: float) -> Row:

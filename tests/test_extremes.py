@@ -52,7 +52,13 @@ def test_slow_motion_beside_a_stiff_spring_is_right():
     assert all(row.error <= 1e-3 for row in lost)
 
 
-@pytest.mark.parametrize("scheme", [ej.EnergyPreserving(), ej.EnergyDecaying(0.5)])
+@pytest.mark.parametrize(
+    "scheme",
+    [
+        ej.EnergyPreserving(),
+        pytest.param(ej.EnergyDecaying(0.5), marks=pytest.mark.slow),
+    ],
+)
 def test_an_equilibrium_is_kept_and_can_be_differentiated(scheme):
     system, _, args = ej.problems.pendulum()
     start = ej.State([0.0, 1.0], [0.0, 0.0])

@@ -73,6 +73,7 @@ def tip(scheme):
     return run
 
 
+@pytest.mark.slow
 def test_gradients_through_a_varying_inertia():
     x, run = jnp.array([1.2, 0.9]), tip(ej.EnergyConsistent(0.3))
     forward, reverse = jax.jacfwd(run)(x), jax.grad(run)(x)

@@ -89,7 +89,7 @@ def tip(g, steps, save_every):
 
 # Steps that fill segments of the run, and that do not.
 @pytest.mark.parametrize(
-    "cut", long([(100, False), (101, False), (103, True)], (100, False))
+    "cut", long([(100, False), (101, False), (103, True)], (100, False), (101, False))
 )
 def test_saving_less_does_not_change_the_gradient(cut, monkeypatch):
     """What the reverse pass computes again is what the run computed."""

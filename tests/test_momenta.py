@@ -159,6 +159,7 @@ def test_angles_keep_the_energy_in_long_runs():
         assert np.max(np.abs(energy - energy[0])) <= 1e-12 * 9.81 * 3
 
 
+@pytest.mark.slow
 def test_the_canonical_top_with_the_flagship():
     system, start, args = problem("top canonical")
     errors = []

@@ -157,7 +157,7 @@ PROGRAMS = dict(
 )
 
 
-@settings(max_examples=30, deadline=None, derandomize=True, database=None)
+@settings(max_examples=15, deadline=None, derandomize=True, database=None)
 @given(**PROGRAMS)
 def test_the_identity_holds_on_random_programs(steps, point, increment):
     _check(steps, point, increment)

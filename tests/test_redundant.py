@@ -111,6 +111,7 @@ def test_multipliers_are_of_least_norm():
         np.testing.assert_allclose(mean, least, atol=100 * h)  # truncation: of five steps
 
 
+@pytest.mark.slow
 def test_derivatives_are_unique():
     def tip(l, num_bars, redundant):
         system, args = _beam(num_bars, redundant)

@@ -34,7 +34,7 @@ OMEGA = np.logspace(-3, 4, 8)
     "scheme",
     [
         ej.EnergyPreserving(),
-        ej.EnergyDecaying(0.5),
+        pytest.param(ej.EnergyDecaying(0.5), marks=pytest.mark.slow),
         pytest.param(ej.EnergyDecaying(0.0), marks=pytest.mark.slow),
         pytest.param(ej.EnergyDecaying(1.0), marks=pytest.mark.slow),
     ],

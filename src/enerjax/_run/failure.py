@@ -38,7 +38,7 @@ def raise_failure(
         tried = done if rejected is None else done + int(rejected) - 1
         residual = float(solution.stats.residual[tried])
         message += f"It came to a residual of {residual:.1e}, scaled to order one. "
-    if solution.result in (RESULTS.not_converged, RESULTS.singular):
+    if solution.result in (RESULTS.not_converged, RESULTS.singular, RESULTS.nonfinite):
         message += _dependent_rows(system, solution, args, begin)
     raise eqx.EquinoxRuntimeError(message + "(`throw=False` returns the run up to there.)")
 
