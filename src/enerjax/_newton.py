@@ -156,8 +156,8 @@ def newton_iterations(
         done = (converged | is_root | ends) & jnp.isfinite(size)
         kept = fresh | shrinks | is_root
         # The first correction after one with a Jacobian of its own is what that has left
-        # over: it went too far where that is more than there was.
-        first = ~fresh & (before.contraction == 0)
+        # over: it went too far where that is more than there was, and more than round-off.
+        first = ~fresh & (before.contraction == 0) & (before.size > eps**0.25)
         less = contraction <= 1 - 0.25 * before.part
         back = first & ~less & ~done & (before.part > _LEAST_PART)
         part = jnp.where(back, 0.5 * before.part, jnp.ones_like(before.part))
