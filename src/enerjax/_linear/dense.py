@@ -21,6 +21,8 @@ from .norms import largest
 SMALL = 32
 # Rows up to which the elimination is written out: it compiles slowly.
 _UNROLLED = 3
+# Rows up to which a product of matrices is a sum along an axis.
+_SUMMED = 10
 
 
 @jax.custom_jvp
@@ -93,19 +95,23 @@ class AbstractFactors(eqx.Module):
 class Inverse(AbstractFactors):
     """An approximate inverse, which a chord iteration makes good.
 
-    Renewed by the iteration of G. Schulz (1933), `X (1 + E + E^2 + ...)` with
-    `E = 1 - A X`, which squares the error at each turn; computed afresh where the old one
-    is too far off.
+    Renewed by the iteration of G. Schulz (1933), `X (1 + E)` or `X (1 + E + E^2)` with
+    `E = 1 - A X`, which leave `E^2` and `E^3`; computed afresh where the old one is too far
+    off. Of the matrix with rows of size one: others would make `E` look larger than it is.
     """
 
     inverse: Float[Array, "n n"]
+    sizes: Float[Array, " n"]
 
     @classmethod
     def empty(cls, size: int, dtype: Any) -> "Inverse":
         """Of no matrix yet: corrects nothing, and is renewed."""
-        return cls(jnp.full((size, size), jnp.nan, dtype))
+        nothing = jnp.full((size, size), jnp.nan, dtype)
+        return cls(nothing, nothing[0])
 
     def renewed(self, matrix: Float[Array, "n n"]) -> "Inverse":
+        sizes = jnp.max(jnp.abs(matrix), axis=1)
+        matrix = matrix / sizes[:, None]
         defect = jnp.eye(matrix.shape[0], dtype=matrix.dtype) - _product(
             matrix, self.inverse
         )
@@ -116,8 +122,12 @@ class Inverse(AbstractFactors):
 
         def turn(carry):
             x, e, _ = carry
-            x, e = x + _product(x, e), _product(e, e)
-            return x, e, _row_sum(e)
+            square = _product(e, e)
+            # What this leaves need not be formed where it is known to be enough.
+            left = _row_sum(e) * _row_sum(square)
+            x = x + _product(x, e + square)
+            e = jax.lax.cond(left > _ENOUGH, lambda: _product(e, square), lambda: square)
+            return x, e, left
 
         def is_lost(carry) -> Flag:
             _, _, size = carry
@@ -129,10 +139,10 @@ class Inverse(AbstractFactors):
 
         carry = self.inverse, defect, _row_sum(defect)
         carry = jax.lax.while_loop(is_rough, turn, carry)
-        return Inverse(jax.lax.while_loop(is_lost, start_again, carry)[0])
+        return Inverse(jax.lax.while_loop(is_lost, start_again, carry)[0], sizes)
 
     def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
-        return self.inverse @ right
+        return self.inverse @ (right / self.sizes)
 
 
 class LU(AbstractFactors):
@@ -172,7 +182,11 @@ _ENOUGH = 1e-5
 
 def _product(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n m"]:
     """A matrix product that XLA fuses with its surroundings, unlike `a @ b`."""
-    return jnp.sum(a[:, :, None] * b[None], axis=1)
+    if a.shape[1] <= _SUMMED:
+        return jnp.sum(a[:, :, None] * b[None], axis=1)
+    # Row by row of `b`: the inner loop is over neighbours, and is vectorised.
+    terms = (a[:, k, None] * b[k] for k in range(a.shape[1]))
+    return functools.reduce(jnp.add, terms)
 
 
 def _row_sum(matrix: Float[Array, "n n"]) -> Scalar:
