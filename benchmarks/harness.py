@@ -29,12 +29,13 @@ def run(
     show: Callable[[list[Row]], None],
     draw: Callable[[list[Row], Path], None],
     peers: Callable[[bool], list[Row]] = lambda quick: [],
+    modes: Sequence[str] = ("default", "fast"),
 ) -> None:
     """The main program of a benchmark.
 
     `rows_of` makes the rows of one setting, in a process of its own, and `peers` those of
-    other programs, here; both are told whether a quick look is wanted. They are shown,
-    drawn, and saved under the name of the script.
+    other programs, here; both are told whether a quick look is wanted. `modes`: the
+    settings of XLA. They are shown, drawn, and saved under the name of the script.
     """
     chosen = _options(sys.modules["__main__"].__doc__ or "")
     _pin()
@@ -45,7 +46,7 @@ def run(
         print(json.dumps(rows_of(chosen.quick)))
         return
     jax.config.update("jax_enable_x64", True)
-    rows = peers(chosen.quick) + _children(script, chosen.quick)
+    rows = peers(chosen.quick) + _children(script, chosen.quick, modes)
     show(rows)
     chosen.out.mkdir(parents=True, exist_ok=True)
     name = Path(script).stem
@@ -67,10 +68,10 @@ def _pin() -> None:
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
 
-def _children(script: str, quick: bool) -> list[Row]:
+def _children(script: str, quick: bool, modes: Sequence[str]) -> list[Row]:
     """The rows of a child for each setting; a GPU knows only one."""
     rows: list[Row] = []
-    for mode in ("default", "fast"):
+    for mode in modes:
         command = [sys.executable, script, "--mode", mode, *(["--quick"] if quick else [])]
         out = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
         *messages, data = out.stdout.splitlines()

@@ -1,0 +1,152 @@
+"""The slow motion of a stiff double pendulum, at steps that hardly see the fast one.
+
+    python benchmarks/stiff.py [--out FOLDER] [--quick]
+
+Case d of the paper, whose inner mass is 200 times lighter: two seconds, in which it is
+whipped around. The error is that of the outer mass at the end, against an explicit run in
+the two angles at tight tolerance. Our schemes beside the generalized-alpha method with the
+same spectral radius at infinity, and SciPy's Radau and BDF methods in the angles. Seconds
+are those of the processor, with `enable_fast_loops()`; SciPy calls Python. `--quick` leaves
+out the shortest steps. Writes stiff.json and stiff.png.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import harness
+import jax
+import jax.numpy as jnp
+import numpy as np
+from references import DOUBLE_PENDULUM, solve
+from scipy.integrate import solve_ivp
+
+import enerjax as ej
+
+
+END = 2.0
+STEPS, QUICK_STEPS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4), (1e-2, 3e-3)
+RADII = (0.9, 0.5, 0.0)
+SCHEMES: dict[str, Callable[..., ej.AbstractScheme]] = {
+    "EnergyConsistent": ej.EnergyConsistent.from_spectral_radius,
+    "EnergyDecaying": ej.EnergyDecaying.from_spectral_radius,
+    "generalized-alpha": ej.GeneralizedAlpha,
+    "generalized-alpha, GGL": lambda rho: ej.GeneralizedAlpha(rho, "ggl"),
+}
+# They have no radius to choose.
+CONSERVING: dict[str, Callable[[], ej.AbstractScheme]] = {
+    "EnergyPreserving": lambda: ej.EnergyPreserving(),
+    "EnergyConsistent(0)": lambda: ej.EnergyConsistent(0.0),
+}
+
+
+def exact() -> np.ndarray:
+    """Where the outer mass ends."""
+    args = ej.problems.stiff_double_pendulum().args
+    return solve(DOUBLE_PENDULUM, args, np.array([END])).q[-1][2:]
+
+
+def our_rows(quick: bool) -> list[harness.Row]:
+    makers = {name: (make, RADII) for name, make in SCHEMES.items()}
+    makers |= {
+        name: (lambda rho, make=make: make(), (1.0,)) for name, make in CONSERVING.items()
+    }
+    system, start, args = ej.problems.stiff_double_pendulum()
+    rows, end = [], exact()
+    for name, (make, radii) in makers.items():
+
+        @jax.jit
+        def run(rho, h, make=make):
+            return ej.simulate(
+                system,
+                make(rho),
+                start,
+                args,
+                h=h,
+                t1=END,
+                max_steps=round(END / STEPS[-1]) + 1,
+                throw=False,
+            )
+
+        for rho in radii:
+            for h in QUICK_STEPS if quick else STEPS:
+                sol = run(rho, h)
+                row = dict(solver=name, rho=rho, h=h, failed="")
+                if sol.result == ej.RESULTS.successful:
+                    row["error"] = float(np.max(np.abs(sol.ys.q[-1, 2:] - end)))
+                    row["energy"] = float(jnp.diff(sol.audit.energy)[0])
+                    row["seconds"] = harness.medians([lambda: run(rho, h)], 3)[0]  # noqa: B023
+                else:
+                    row["failed"] = str(ej.RESULTS[sol.result]).partition(":")[0]
+                rows.append(row | harness.device())
+    return rows
+
+
+def scipy_rows(quick: bool) -> list[harness.Row]:
+    args = {k: float(x) for k, x in ej.problems.stiff_double_pendulum().args.items()}
+    rows, end = [], exact()
+    for method in ("Radau", "BDF"):
+        for tolerance in (1e-3, 1e-5, 1e-7, 1e-9):
+
+            def run(method=method, tolerance=tolerance):
+                return solve_ivp(
+                    lambda t, y: DOUBLE_PENDULUM.rates(y, args),
+                    (0, END),
+                    DOUBLE_PENDULUM.start(args),
+                    method=method,
+                    rtol=tolerance,
+                    atol=tolerance,
+                )
+
+            last = run().y[:, -1]
+            position = DOUBLE_PENDULUM.as_state(last, args)[0][2:]
+            row = dict(mode="peer", solver=f"{method}, in angles", rho=tolerance, failed="")
+            row["error"] = float(np.max(np.abs(position - end)))
+            row["seconds"] = harness.medians([run], 1)[0]
+            # The mean step: tolerances do not compare with steps.
+            row["h"] = END / (run().t.size - 1)
+            rows.append(row)
+    return rows
+
+
+def show(rows: list[harness.Row]) -> None:
+    ours = [row for row in rows if row["mode"] != "peer"]
+    steps = sorted({row["h"] for row in ours}, reverse=True)
+    print(f"{'error of the outer mass, h =':34s}" + "".join(f"{h:10.0e}" for h in steps))
+    for name, rho in dict.fromkeys((row["solver"], row["rho"]) for row in ours):
+        line = {r["h"]: r for r in ours if (r["solver"], r["rho"]) == (name, rho)}
+        cells = (
+            f"{line[h]['error']:10.1e}" if "error" in line[h] else f"{'failed':>10s}"
+            for h in steps
+        )
+        print(f"{name:24s} rho {rho:<6g}" + "".join(cells))
+    for row in rows:
+        seconds = f"{1e3 * row['seconds']:.1f} ms" if "seconds" in row else row["failed"]
+        print(
+            f"  {row['solver']:24s} {row['rho']:<6g} h {row['h']:.1e}: "
+            f"error {row.get('error', np.nan):.1e}, {seconds}"
+        )
+
+
+def draw(rows: list[harness.Row], path: Path) -> None:
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, len(RADII), figsize=(12, 4), sharey=True)
+    for axis, rho in zip(axes, RADII, strict=True):
+        here = [r for r in rows if r.get("rho") in (rho, 1.0) or r["mode"] == "peer"]
+        for name in dict.fromkeys(row["solver"] for row in here):
+            line = sorted(
+                (r["h"], r["error"]) for r in here if r["solver"] == name and "error" in r
+            )
+            style = "s:" if "angles" in name else "^--" if "alpha" in name else "o-"
+            axis.loglog(*zip(*line, strict=True), style, label=name, markersize=4)
+        axis.set(
+            title=f"spectral radius {rho:g} (where there is one)", xlabel="(mean) step [s]"
+        )
+    axes[0].set_ylabel("error of the outer mass at 2 s [m]")
+    axes[0].legend(fontsize=6)
+    figure.tight_layout()
+    figure.savefig(path, dpi=130)
+
+
+if __name__ == "__main__":
+    harness.run(__file__, our_rows, show, draw, scipy_rows, ["fast"])
