@@ -1,6 +1,6 @@
 """Error against time: our schemes, explicit integrators and DAE solvers, on one core.
 
-    python benchmarks/speed_accuracy.py [--out FOLDER] [--quick]
+    python benchmarks/speed_accuracy.py [--out FOLDER] [--quick] [--only PROBLEM]
 
 Points on rods that fall from the horizontal (one, two, two with an inner mass 200 times
 lighter, 8 and 64 of them) and the heavy top. Ours, with XLA's default settings and with
@@ -12,9 +12,10 @@ medians, of the processor, without what is done once: compiling, building the mo
 solver calls Python (SciPy, IDA) the equations of chains are compiled with numba, those of
 the top are NumPy's. Prints, for each problem and error, the cheapest run of each solver.
 Writes speed_accuracy.json and .png.
+With `--quick` without chains; `--only` runs one problem and keeps what is saved of others.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,12 +39,11 @@ SCHEMES: dict[str, Callable[[], ej.AbstractScheme]] = {
 COLOURS = dict(ours="C0", dae="C3", ode="C2")
 
 
-def our_rows(quick: bool) -> list[harness.Row]:
+def our_rows(quick: bool, names: Sequence[str]) -> list[harness.Row]:
     rows: list[harness.Row] = []
     programs: list[Callable] = []
-    for name, work in WORKS.items():
-        if quick and work.size > 2:
-            continue
+    works = _chosen(quick, names)
+    for name, work in works.items():
         exact = work.exact()
         for label, make in SCHEMES.items():
             for h in work.steps.get(label, ()):
@@ -56,10 +56,9 @@ def our_rows(quick: bool) -> list[harness.Row]:
     for row, seconds in zip(timed, times, strict=True):
         row["seconds"] = seconds
     # It is in JAX too, and what XLA is told serves it as well.
-    for name, work in WORKS.items():
-        if not (quick and work.size > 2):
-            peers = diffrax_rows(work, work.exact(), repeats)
-            rows += [dict(work=name) | row for row in peers]
+    for name, work in works.items():
+        peers = diffrax_rows(work, work.exact(), repeats)
+        rows += [dict(work=name) | row for row in peers]
     return [row | harness.device() for row in rows]
 
 
@@ -90,12 +89,14 @@ def _our_run(
     return row, (lambda: program(start, args, h)) if error <= BOUND else None
 
 
-def peer_rows(quick: bool) -> list[harness.Row]:
+def _chosen(quick: bool, names: Sequence[str]) -> dict[str, Work]:
+    return {n: w for n, w in WORKS.items() if n in names and not (quick and w.size > 2)}
+
+
+def peer_rows(quick: bool, names: Sequence[str]) -> list[harness.Row]:
     repeats = QUICK_REPEATS if quick else 3
     rows: list[harness.Row] = []
-    for name, work in WORKS.items():
-        if quick and work.size > 2:
-            continue
+    for name, work in _chosen(quick, names).items():
         exact = work.exact()
         for solver in SOLVERS:
             for row in solver(work, exact, repeats):
@@ -166,4 +167,4 @@ def draw(rows: list[harness.Row], path: Path) -> None:
 
 
 if __name__ == "__main__":
-    harness.run(__file__, our_rows, show, draw, peer_rows)
+    harness.run(__file__, our_rows, show, draw, peer_rows, works=tuple(WORKS))

@@ -111,20 +111,22 @@ def scipy_rows(quick: bool) -> list[harness.Row]:
 def show(rows: list[harness.Row]) -> None:
     ours = [row for row in rows if row["mode"] != "peer"]
     steps = sorted({row["h"] for row in ours}, reverse=True)
-    print(f"{'error of the outer mass, h =':34s}" + "".join(f"{h:10.0e}" for h in steps))
-    for name, rho in dict.fromkeys((row["solver"], row["rho"]) for row in ours):
-        line = {r["h"]: r for r in ours if (r["solver"], r["rho"]) == (name, rho)}
-        cells = (
-            f"{line[h]['error']:10.1e}" if "error" in line[h] else f"{'failed':>10s}"
-            for h in steps
-        )
-        print(f"{name:24s} rho {rho:<6g}" + "".join(cells))
+    for key, title, scale, form in (
+        ("error", "error of the outer mass [m]", 1.0, ".1e"),
+        ("seconds", "time of the run [ms]", 1e3, ".3g"),
+    ):
+        print(f"\n{title:28s} h = " + "".join(f"{h:10.0e}" for h in steps))
+        for name, rho in dict.fromkeys((row["solver"], row["rho"]) for row in ours):
+            line = {r["h"]: r for r in ours if (r["solver"], r["rho"]) == (name, rho)}
+            found = (line[h].get(key) for h in steps)
+            cells = ("failed" if x is None else format(scale * x, form) for x in found)
+            print(f"{name:24s} {rho:<8g}" + "".join(f"{cell:>10s}" for cell in cells))
     for row in rows:
-        seconds = f"{1e3 * row['seconds']:.1f} ms" if "seconds" in row else row["failed"]
-        print(
-            f"  {row['solver']:24s} {row['rho']:<6g} h {row['h']:.1e}: "
-            f"error {row.get('error', np.nan):.1e}, {seconds}"
-        )
+        if row["mode"] == "peer":
+            print(
+                f"SciPy's {row['solver']}, tolerance {row['rho']:g}: error {row['error']:.1e}, "
+                f"mean step {row['h']:.0e} s, {1e3 * row['seconds']:.0f} ms"
+            )
 
 
 def draw(rows: list[harness.Row], path: Path) -> None:
