@@ -3,9 +3,8 @@
     python benchmarks/speed_accuracy.py [--out FOLDER] [--quick] [--only PROBLEM]
 
 Points on rods that fall from the horizontal (one, two, two with an inner mass 200 times
-lighter, 8 and 64 of them) and the heavy top. Ours, with XLA's default settings and with
-`enable_fast_loops()` (two processes); diffrax in minimal coordinates and on the same model
-by `to_diffrax`; SciPy's DOP853; EXUDYN's generalized-alpha method and trapezoidal rule;
+lighter, 8 and 64 of them) and the heavy top. Ours, with `enable_fast_loops()`; diffrax,
+which profits by it too, in minimal coordinates and on the same model by `to_diffrax`; SciPy's DOP853; EXUDYN's generalized-alpha method and trapezoidal rule;
 IDA of SUNDIALS on the stabilised index-2 equations (extra `peers`). The error is the
 largest of any point at the end, against an explicit run at tight tolerance. Times are
 medians, of the processor, without what is done once: compiling, building the model. Where a
@@ -55,7 +54,7 @@ def our_rows(quick: bool, names: Sequence[str]) -> list[harness.Row]:
     times = harness.medians(programs, repeats)
     for row, seconds in zip(timed, times, strict=True):
         row["seconds"] = seconds
-    # It is in JAX too, and what XLA is told serves it as well.
+    # In this process: it is in JAX too.
     for name, work in works.items():
         peers = diffrax_rows(work, work.exact(), repeats)
         rows += [dict(work=name) | row for row in peers]
@@ -109,8 +108,7 @@ def cheapest(rows: list[harness.Row], error: float) -> dict[str, float]:
     best: dict[str, float] = {}
     for row in rows:
         if row["error"] <= error and "seconds" in row:
-            mode = "" if row["mode"] == "peer" else f", {row['mode']}"
-            key = f"{row['kind']}: {row['solver']}{mode}"
+            key = f"{row['kind']}: {row['solver']}"
             best[key] = min(best.get(key, np.inf), 1e3 * row["seconds"])
     return best
 
@@ -148,23 +146,17 @@ def draw(rows: list[harness.Row], path: Path) -> None:
     figure, axes = plt.subplots(2, -(-len(names) // 2), figsize=(13, 8), squeeze=False)
     for axis, name in zip(axes.ravel(), names, strict=False):
         here = [r for r in rows if r["work"] == name and "seconds" in r]
-        for solver, mode in sorted({(r["solver"], r["mode"]) for r in here}):
-            line = sorted(
-                (r["seconds"], r["error"], r["kind"])
-                for r in here
-                if (r["solver"], r["mode"]) == (solver, mode)
-            )
-            seconds, errors, kinds = zip(*line, strict=True)
-            style = "--" if mode == "default" else "-"
-            axis.loglog(seconds, errors, style, marker=".", color=COLOURS[kinds[0]])
+        for solver in sorted({r["solver"] for r in here}):
+            mine = [r for r in here if r["solver"] == solver]
+            line = sorted((r["seconds"], r["error"]) for r in mine)
+            seconds, errors = zip(*line, strict=True)
+            axis.loglog(seconds, errors, ".-", color=COLOURS[mine[0]["kind"]])
             axis.annotate(solver, (seconds[-1], errors[-1]), fontsize=5)
         axis.set(title=name, xlabel="seconds of computation", ylabel="error at the end")
-    figure.suptitle(
-        "ours (blue; dashed: default XLA), DAE solvers (red), explicit ODE (green)"
-    )
+    figure.suptitle("ours (blue), DAE solvers (red), explicit ODE (green)")
     figure.tight_layout()
     figure.savefig(path, dpi=130)
 
 
 if __name__ == "__main__":
-    harness.run(__file__, our_rows, show, draw, peer_rows, works=tuple(WORKS))
+    harness.run(__file__, our_rows, show, draw, peer_rows, ["fast"], tuple(WORKS))

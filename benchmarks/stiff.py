@@ -5,13 +5,16 @@
 Case d of the paper, whose inner mass is 200 times lighter: two seconds, in which it is
 whipped around. The error is that of the outer mass at the end, against an explicit run in
 the two angles at tight tolerance. Our schemes beside the generalized-alpha method with the
-same spectral radius at infinity, and SciPy's Radau and BDF methods in the angles. Seconds
-are those of the processor, with `enable_fast_loops()`; SciPy calls Python. `--quick` leaves
-out the shortest steps. Writes stiff.json and stiff.png.
+same spectral radius at infinity; with steps of varying length `EnergyConsistent(0)`, and
+SciPy's Radau and BDF methods in the angles. Seconds are those of the processor, with
+`enable_fast_loops()`; SciPy calls Python. `--quick` leaves out the shortest steps. Writes
+stiff.json and stiff.png.
 """
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import harness
 import jax
@@ -26,6 +29,7 @@ import enerjax as ej
 END = 2.0
 STEPS, QUICK_STEPS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4), (1e-2, 3e-3)
 RADII = (0.9, 0.5, 0.0)
+TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9)
 SCHEMES: dict[str, Callable[..., ej.AbstractScheme]] = {
     "EnergyConsistent": ej.EnergyConsistent.from_spectral_radius,
     "EnergyDecaying": ej.EnergyDecaying.from_spectral_radius,
@@ -50,42 +54,58 @@ def our_rows(quick: bool) -> list[harness.Row]:
     makers |= {
         name: (lambda rho, make=make: make(), (1.0,)) for name, make in CONSERVING.items()
     }
-    system, start, args = ej.problems.stiff_double_pendulum()
     rows, end = [], exact()
     for name, (make, radii) in makers.items():
-
-        @jax.jit
-        def run(rho, h, make=make):
-            return ej.simulate(
-                system,
-                make(rho),
-                start,
-                args,
-                h=h,
-                t1=END,
-                max_steps=round(END / STEPS[-1]) + 1,
-                throw=False,
-            )
-
+        run = jax.jit(lambda rho, h, make=make: _run(make(rho), h))
         for rho in radii:
             for h in QUICK_STEPS if quick else STEPS:
-                sol = run(rho, h)
-                row = dict(solver=name, rho=rho, h=h, failed="")
-                if sol.result == ej.RESULTS.successful:
-                    row["error"] = float(np.max(np.abs(sol.ys.q[-1, 2:] - end)))
-                    row["energy"] = float(jnp.diff(sol.audit.energy)[0])
-                    row["seconds"] = harness.medians([lambda: run(rho, h)], 3)[0]  # noqa: B023
-                else:
-                    row["failed"] = str(ej.RESULTS[sol.result]).partition(":")[0]
-                rows.append(row | harness.device())
-    return rows
+                row = dict(solver=name, rho=rho, h=h)
+                rows.append(row | _outcome(functools.partial(run, rho, h), end))
+    vary = lambda tol: _run(ej.EnergyConsistent(0.0), 1e-3, ej.StepController(tol, tol))
+    run = jax.jit(vary)
+    for tolerance in TOLERANCES:
+        row = dict(solver="EnergyConsistent(0), adaptive", tolerance=tolerance)
+        stats = run(tolerance).stats
+        row["h"] = END / float(stats.completed_steps + stats.rejected_steps)
+        rows.append(row | _outcome(functools.partial(run, tolerance), end))
+    return [row | harness.device() for row in rows]
+
+
+def _run(
+    scheme: ej.AbstractScheme, h: Any, controller: ej.StepController | None = None
+) -> ej.Solution:
+    system, start, args = ej.problems.stiff_double_pendulum()
+    most = round(END / STEPS[-1]) + 1 if controller is None else None
+    return ej.simulate(
+        system,
+        scheme,
+        start,
+        args,
+        h=h,
+        t1=END,
+        max_steps=most,
+        controller=controller,
+        throw=False,
+    )
+
+
+def _outcome(run: Callable[[], ej.Solution], end: np.ndarray) -> harness.Row:
+    """The error and the time, or why there are none."""
+    sol = run()
+    if sol.result != ej.RESULTS.successful:
+        return dict(failed=str(ej.RESULTS[sol.result]).partition(":")[0])
+    return dict(
+        error=float(np.max(np.abs(sol.ys.q[-1, 2:] - end))),
+        energy=float(jnp.diff(sol.audit.energy)[0]),
+        seconds=harness.medians([run], 3)[0],
+    )
 
 
 def scipy_rows(quick: bool) -> list[harness.Row]:
     args = {k: float(x) for k, x in ej.problems.stiff_double_pendulum().args.items()}
     rows, end = [], exact()
     for method in ("Radau", "BDF"):
-        for tolerance in (1e-3, 1e-5, 1e-7, 1e-9):
+        for tolerance in TOLERANCES:
 
             def run(method=method, tolerance=tolerance):
                 return solve_ivp(
@@ -99,7 +119,7 @@ def scipy_rows(quick: bool) -> list[harness.Row]:
 
             last = run().y[:, -1]
             position = DOUBLE_PENDULUM.as_state(last, args)[0][2:]
-            row = dict(mode="peer", solver=f"{method}, in angles", rho=tolerance, failed="")
+            row = dict(mode="peer", solver=f"{method}, in angles", tolerance=tolerance)
             row["error"] = float(np.max(np.abs(position - end)))
             row["seconds"] = harness.medians([run], 1)[0]
             # The mean step: tolerances do not compare with steps.
@@ -109,7 +129,7 @@ def scipy_rows(quick: bool) -> list[harness.Row]:
 
 
 def show(rows: list[harness.Row]) -> None:
-    ours = [row for row in rows if row["mode"] != "peer"]
+    ours = [row for row in rows if "rho" in row]
     steps = sorted({row["h"] for row in ours}, reverse=True)
     for key, title, scale, form in (
         ("error", "error of the outer mass [m]", 1.0, ".1e"),
@@ -121,12 +141,12 @@ def show(rows: list[harness.Row]) -> None:
             found = (line[h].get(key) for h in steps)
             cells = ("failed" if x is None else format(scale * x, form) for x in found)
             print(f"{name:24s} {rho:<8g}" + "".join(f"{cell:>10s}" for cell in cells))
-    for row in rows:
-        if row["mode"] == "peer":
-            print(
-                f"SciPy's {row['solver']}, tolerance {row['rho']:g}: error {row['error']:.1e}, "
-                f"mean step {row['h']:.0e} s, {1e3 * row['seconds']:.0f} ms"
-            )
+    for row in (row for row in rows if "tolerance" in row):
+        result = f"error {row['error']:.1e}" if "error" in row else row["failed"]
+        print(
+            f"{row['solver']:30s} tolerance {row['tolerance']:.0e}: {result}, "
+            f"mean step {row['h']:.1e} s, {1e3 * row.get('seconds', np.nan):.3g} ms"
+        )
 
 
 def draw(rows: list[harness.Row], path: Path) -> None:
@@ -134,12 +154,13 @@ def draw(rows: list[harness.Row], path: Path) -> None:
 
     figure, axes = plt.subplots(1, len(RADII), figsize=(12, 4), sharey=True)
     for axis, rho in zip(axes, RADII, strict=True):
-        here = [r for r in rows if r.get("rho") in (rho, 1.0) or r["mode"] == "peer"]
+        here = [r for r in rows if r.get("rho") in (rho, 1.0, None)]
         for name in dict.fromkeys(row["solver"] for row in here):
             line = sorted(
                 (r["h"], r["error"]) for r in here if r["solver"] == name and "error" in r
             )
             style = "s:" if "angles" in name else "^--" if "alpha" in name else "o-"
+            style = "D-" if "adaptive" in name else style
             axis.loglog(*zip(*line, strict=True), style, label=name, markersize=4)
         axis.set(
             title=f"spectral radius {rho:g} (where there is one)", xlabel="(mean) step [s]"
