@@ -4,14 +4,15 @@
 
 Points on rods that fall from the horizontal (one, two, two with an inner mass 200 times
 lighter, 8 and 64 of them) and the heavy top. Ours, with `enable_fast_loops()`; diffrax,
-which profits by it too, in minimal coordinates and on the same model by `to_diffrax`; SciPy's DOP853; EXUDYN's generalized-alpha method and trapezoidal rule;
-IDA of SUNDIALS on the stabilised index-2 equations (extra `peers`). The error is the
-largest of any point at the end, against an explicit run at tight tolerance. Times are
-medians, of the processor, without what is done once: compiling, building the model. Where a
-solver calls Python (SciPy, IDA) the equations of chains are compiled with numba, those of
-the top are NumPy's. Prints, for each problem and error, the cheapest run of each solver.
-Writes speed_accuracy.json and .png.
-With `--quick` without chains; `--only` runs one problem and keeps what is saved of others.
+which profits by it too, in minimal coordinates and on the same model by `to_diffrax`;
+SciPy's DOP853; EXUDYN's generalized-alpha method and trapezoidal rule; IDA of SUNDIALS on
+the stabilised index-2 equations (extra `peers`). The error is the largest of any point at
+the end, against an explicit run at tight tolerance. Times are medians, of the processor,
+without what is done once: compiling, building the model. Where a solver calls Python
+(SciPy, IDA) the equations of chains are compiled with numba, those of the top are NumPy's.
+Prints, for each problem and error, the cheapest run of each solver. Writes
+speed_accuracy.json and .png. With `--quick` without chains; `--only` runs one problem and
+keeps what is saved of others.
 """
 
 from collections.abc import Callable, Sequence
