@@ -206,13 +206,15 @@ def show(rows: list[harness.Row]) -> None:
 def draw(rows: list[harness.Row], path: Path) -> None:
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    figure, axes = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
     for axis, work in zip(axes, ("double pendulum", "heavy top"), strict=True):
         for row in (row for row in rows if row["work"] == work):
             solver, at = row["solver"], (row["seconds"], row["energy"])
             kinds = dict(EXUDYN="C3", diffrax="C2")
             axis.loglog(*at, "o", color=kinds.get(solver.split()[0], "C0"))
-            axis.annotate(f"{solver}, {row['setting']}", at, fontsize=6)
+            label = f"{solver}\n{row['setting']}"
+            axis.annotate(label, at, (4, 4), textcoords="offset points", fontsize=6)
+        axis.margins(0.25, 0.1)
         axis.set(title=work, xlabel="seconds of computation", ylabel="error of the energy")
     figure.suptitle("1e4 seconds: ours (blue), DAE (red), explicit in minimal coordinates")
     figure.savefig(path, dpi=130)

@@ -154,6 +154,8 @@ def draw(rows: list[harness.Row], path: Path) -> None:
             axis.loglog(seconds, errors, ".-", color=COLOURS[mine[0]["kind"]])
             axis.annotate(solver, (seconds[-1], errors[-1]), fontsize=5)
         axis.set(title=name, xlabel="seconds of computation", ylabel="error at the end")
+    for axis in axes.ravel()[len(names) :]:
+        axis.set_visible(False)
     figure.suptitle("ours (blue), DAE solvers (red), explicit ODE (green)")
     figure.tight_layout()
     figure.savefig(path, dpi=130)

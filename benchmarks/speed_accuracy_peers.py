@@ -73,10 +73,9 @@ def scipy_rows(work: Work, exact: np.ndarray, repeats: int) -> Rows:
             options = dict(method="DOP853", rtol=tolerance, atol=tolerance)
             return position(solve_ivp(rates, (0, work.end), y0, **options).y[:, -1])
 
+        solver = f"SciPy DOP853, {'minimal' if work.is_top else 'index 1'}"
         setting = f"rtol {tolerance:g}"
-        yield from _row(
-            "ode", "SciPy DOP853", setting, work, exact, lambda run=run: run, repeats
-        )
+        yield from _row("ode", solver, setting, work, exact, lambda run=run: run, repeats)
 
 
 def _start(work: Work) -> np.ndarray:
