@@ -109,8 +109,9 @@ def _diffrax_rows(end: float) -> list[harness.Row]:
                     stepsize_controller=diffrax.PIDController(tolerance, tolerance),
                     max_steps=10**6,
                     adjoint=diffrax.ForwardMode(),
-                ).ys[0]
-                return out, out
+                )
+                after = jnp.asarray(out.ys)[0]
+                return after, after
 
             ts = end / SAVES * jnp.arange(SAVES)
             return jnp.concatenate([y0[None], jax.lax.scan(go_on, y0, ts)[1]])

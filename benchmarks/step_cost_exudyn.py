@@ -70,7 +70,7 @@ def prepared_top(h: float, end: float) -> Callable[[], tuple[np.ndarray, ...]]:
     container, system, read = _top()
     settings = _settings(h, round(end / h))
 
-    def run(container=container) -> np.ndarray:
+    def run(container=container) -> tuple[np.ndarray, ...]:
         system.SolveDynamic(settings, solverType=exu.DynamicSolverType.GeneralizedAlpha)
         kinds = exu.OutputVariableType
         wanted = kinds.Position, kinds.Velocity, kinds.AngularVelocityLocal
