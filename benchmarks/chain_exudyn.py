@@ -1,11 +1,11 @@
-"""A chain of points on rods in EXUDYN, for `chain.py`."""
+"""A chain of points on rods in EXUDYN."""
 
 # pyright: reportArgumentType=false, reportMissingImports=false
 
 import statistics
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 
 sys.exudynFast = True  # pyright: ignore[reportAttributeAccessIssue]
@@ -47,26 +47,31 @@ def _settings(h: float, steps: int, rho: float, is_sparse: bool):
     return settings
 
 
-def end(
-    masses: Sequence[float], length: float, h: float, end: float, rho: float
-) -> np.ndarray:
-    """Positions at the end of a run."""
-    return end_state(masses, length, h, end, rho)[0]
+def prepared(
+    masses: Sequence[float],
+    length: float,
+    h: float,
+    end: float,
+    rho: float | None,
+) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
+    """A run that is yet to be made: the positions and velocities at its end.
 
+    With the generalized-alpha method, or without `rho` the trapezoidal rule of index 2.
+    """
+    container, system, nodes = _build(masses, length)
+    settings = _settings(h, round(end / h), rho or 1.0, len(masses) > 8)
+    kinds = exu.DynamicSolverType
+    solver = kinds.TrapezoidalIndex2 if rho is None else kinds.GeneralizedAlpha
 
-def end_state(
-    masses: Sequence[float], length: float, h: float, end: float, rho: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and velocities at the end of a run."""
-    _container, system, nodes = _build(masses, length)
-    settings = _settings(h, round(end / h), rho, len(masses) > 8)
-    system.SolveDynamic(settings, solverType=exu.DynamicSolverType.GeneralizedAlpha)
-    kinds = exu.OutputVariableType
-    q, v = (
-        np.concatenate([system.GetNodeOutput(node, kind)[:2] for node in nodes])
-        for kind in (kinds.Position, kinds.Velocity)
-    )
-    return q, v
+    def run(container=container) -> tuple[np.ndarray, np.ndarray]:
+        system.SolveDynamic(settings, solverType=solver)
+        read = lambda kind: np.concatenate(
+            [system.GetNodeOutput(n, kind)[:2] for n in nodes]
+        )
+        kinds = exu.OutputVariableType
+        return read(kinds.Position), read(kinds.Velocity)
+
+    return run
 
 
 def us_per_step(num_links: int, h: float, steps: int, repeats: int = 3) -> float:

@@ -25,38 +25,55 @@ Row = dict[str, Any]
 
 def run(
     script: str,
-    rows_of: Callable[[bool], list[Row]],
+    rows_of: Callable[..., list[Row]],
     show: Callable[[list[Row]], None],
     draw: Callable[[list[Row], Path], None],
-    peers: Callable[[bool], list[Row]] = lambda quick: [],
+    peers: Callable[..., list[Row]] = lambda quick: [],
+    modes: Sequence[str] = ("default", "fast"),
+    works: Sequence[str] = (),
 ) -> None:
     """The main program of a benchmark.
 
     `rows_of` makes the rows of one setting, in a process of its own, and `peers` those of
-    other programs, here; both are told whether a quick look is wanted. They are shown,
-    drawn, and saved under the name of the script.
+    other programs, here; both are told whether a quick look is wanted. `modes`: the
+    settings of XLA. They are shown, drawn, and saved under the name of the script. With
+    `works` both also take names of these, one or all of them; rows tell theirs as `work`,
+    and those of one that is run again replace what was saved.
     """
-    chosen = _options(sys.modules["__main__"].__doc__ or "")
+    chosen = _options(sys.modules["__main__"].__doc__ or "", works)
+    asked = (
+        (chosen.quick, [chosen.only] if chosen.only else works)
+        if works
+        else (chosen.quick,)
+    )
     _pin()
     if chosen.mode is not None:
         if chosen.mode == "fast":
             ej.enable_fast_loops()
         jax.config.update("jax_enable_x64", True)
-        print(json.dumps(rows_of(chosen.quick)))
+        print(json.dumps(rows_of(*asked)))
         return
     jax.config.update("jax_enable_x64", True)
-    rows = peers(chosen.quick) + _children(script, chosen.quick)
+    flags = ["--quick"] if chosen.quick else []
+    flags += ["--only", chosen.only] if chosen.only else []
+    rows = peers(*asked) + _children(script, flags, modes)
     show(rows)
     chosen.out.mkdir(parents=True, exist_ok=True)
-    name = Path(script).stem
-    (chosen.out / f"{name}.json").write_text(json.dumps(rows, indent=1))
-    draw(rows, chosen.out / f"{name}.png")
+    saved = chosen.out / f"{Path(script).stem}.json"
+    if chosen.only and saved.exists():
+        old = json.loads(saved.read_text())
+        rows = [row for row in old if row["work"] != chosen.only] + rows
+    saved.write_text(json.dumps(rows, indent=1))
+    draw(rows, saved.with_suffix(".png"))
 
 
-def _options(doc: str) -> argparse.Namespace:
+def _options(doc: str, works: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=doc.partition("\n")[0])
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     parser.add_argument("--quick", action="store_true", help="less work, rougher times")
+    parser.set_defaults(only=None)
+    if works:
+        parser.add_argument("--only", choices=works, help="one of its problems")
     parser.add_argument("--mode", choices=["default", "fast"], help=argparse.SUPPRESS)
     return parser.parse_args()
 
@@ -67,11 +84,11 @@ def _pin() -> None:
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
 
-def _children(script: str, quick: bool) -> list[Row]:
+def _children(script: str, flags: list[str], modes: Sequence[str]) -> list[Row]:
     """The rows of a child for each setting; a GPU knows only one."""
     rows: list[Row] = []
-    for mode in ("default", "fast"):
-        command = [sys.executable, script, "--mode", mode, *(["--quick"] if quick else [])]
+    for mode in modes:
+        command = [sys.executable, script, "--mode", mode, *flags]
         out = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
         *messages, data = out.stdout.splitlines()
         print("\n".join(messages)) if messages else None

@@ -13,6 +13,8 @@ import enerjax as ej
 
 
 G = 9.81
+# What counts as an answer at all: no time is told for other runs.
+BOUND = 0.1
 Steps = dict[str, tuple[float, ...]]
 
 
@@ -109,5 +111,5 @@ WORKS = {
     "chain of 8": Work(
         (1 / 8,) * 8, 1 / 8, 2.0, _steps((1e-3, 2.5e-4), (2e-3, 1e-3, 2.5e-4))
     ),
-    "chain of 64": Work((1 / 64,) * 64, 1 / 64, 1.0, _steps((1e-3,), (1e-3, 5e-4))),
+    "chain of 64": Work((1 / 64,) * 64, 1 / 64, 1.0, _steps((1e-3,), (1e-3,))),
 }

@@ -58,15 +58,25 @@ def _top():
     system.AddObject(eu.SphericalJoint(markerNumbers=[first, second]))
     system.Assemble()
     position = exu.OutputVariableType.Position
-    return container, system, lambda: system.GetNodeOutput(body["nodeNumber"], position)
+    read = lambda kind=position: system.GetNodeOutput(body["nodeNumber"], kind)
+    return container, system, read
 
 
-def end_of_top(h: float, end: float) -> np.ndarray:
-    """The position of the top at the end of a run."""
-    _container, system, position = _top()
+def prepared_top(h: float, end: float) -> Callable[[], tuple[np.ndarray, ...]]:
+    """A run of the top that is yet to be made: where it ends.
+
+    Position, velocity, and angular velocity in axes of the body.
+    """
+    container, system, read = _top()
     settings = _settings(h, round(end / h))
-    system.SolveDynamic(settings, solverType=exu.DynamicSolverType.GeneralizedAlpha)
-    return np.asarray(position())
+
+    def run(container=container) -> tuple[np.ndarray, ...]:
+        system.SolveDynamic(settings, solverType=exu.DynamicSolverType.GeneralizedAlpha)
+        kinds = exu.OutputVariableType
+        wanted = kinds.Position, kinds.Velocity, kinds.AngularVelocityLocal
+        return tuple(np.asarray(read(kind)) for kind in wanted)
+
+    return run
 
 
 def _settings(h: float, steps: int):
