@@ -15,7 +15,7 @@ import argparse
 import csv
 import dataclasses
 import time
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 
 import jax
@@ -30,7 +30,7 @@ def axes(quick: bool, long: bool) -> dict:
     import extremes_numbers as numbers
 
     return {
-        "step": lambda: numbers.step_rows(quick),
+        "step": lambda: chain(numbers.step_rows(quick), numbers.mechanism_step_rows(quick)),
         "stiffness": lambda: numbers.stiffness_rows(quick),
         "alpha": lambda: numbers.alpha_rows(quick),
         "settled": lambda: numbers.settling_rows(quick),

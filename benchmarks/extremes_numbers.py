@@ -82,10 +82,9 @@ def step_rows(quick: bool) -> Iterator[Row]:
                 # Truncation in 1/(h omega).
                 yield judge(place, solution, error_of, 20 / x)
             yield _quartic_row(name, scheme, x)
-    yield from _mechanism_rows(quick)
 
 
-def _mechanism_rows(quick: bool) -> Iterator[Row]:
+def mechanism_step_rows(quick: bool) -> Iterator[Row]:
     """Steps from far below to far above the period of the fastest motion."""
     cases = {
         # Spins with 150 rad/s.

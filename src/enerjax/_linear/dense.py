@@ -185,7 +185,7 @@ def _product(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n 
     if a.shape[1] <= _SUMMED:
         return jnp.sum(a[:, :, None] * b[None], axis=1)
     # Row by row of `b`: the inner loop is over neighbours, and is vectorised.
-    terms = (a[:, k, None] * b[k] for k in range(a.shape[1]))
+    terms = (a[:, k, None] * b[None, k] for k in range(a.shape[1]))
     return functools.reduce(jnp.add, terms)
 
 
