@@ -117,7 +117,7 @@ def jump_loads(
     model = problem.model
     if model.system.force is None:
         return Loads()
-    return _loads(model.force, alpha, z, problem, jump, end)
+    return Loads(*_loads(model.force, alpha, z, problem, jump, end))
 
 
 def _loads(
@@ -127,7 +127,8 @@ def _loads(
     problem: StepProblem,
     jump: State,
     end: State,
-) -> Loads:
+) -> tuple[Coordinates, Coordinates, Coordinates, Coordinates]:
+    """The fields of `Loads` for one force."""
     model, start = problem.model, problem.start
     v0, vj = model.velocity(start), model.velocity(jump)
     lag = model.push(start.q, problem.at(z.end), z.jump.rate)
@@ -137,7 +138,7 @@ def _loads(
     before = problem.load(law, start, jump, z.end, mean)
     at_start = problem.load(law, start, start, z.end, v0)
     at_jump = problem.load(law, jump, jump, z.end, vj)
-    return Loads(after, before, at_start, at_jump)
+    return after, before, at_start, at_jump
 
 
 def jump_work(
@@ -146,11 +147,10 @@ def jump_work(
     """The work that a force does in a discontinuous step."""
 
     def work(law: Law) -> Scalar:
-        loads = _loads(law, alpha, z, problem, jump, end)
+        after, before, at_start, at_jump = _loads(law, alpha, z, problem, jump, end)
         # The last part is the work of `alpha/6 (F_j - F_0)`.
-        share = 0.5 * alpha.astype(loads.before.dtype)
-        over_jump = loads.before + share * (loads.jump - loads.start)
-        return loads.after @ (z.end.rate - z.jump.rate) + over_jump @ z.jump.rate
+        over_jump = before + 0.5 * alpha.astype(before.dtype) * (at_jump - at_start)
+        return after @ (z.end.rate - z.jump.rate) + over_jump @ z.jump.rate
 
     return work
 
