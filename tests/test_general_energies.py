@@ -83,6 +83,7 @@ def test_gradients_through_a_varying_inertia():
     np.testing.assert_allclose(reverse, difference, rtol=1e-7, atol=1e-8)  # differences
 
 
+@pytest.mark.slow
 def test_lanes_of_a_sweep_are_their_single_runs():
     system, start, args = ej.problems.double_pendulum_angles()
 

@@ -48,8 +48,10 @@ def by_differences(fn, p):
 
 
 # Everything that converges on the pendulum. The preserving schemes have no alpha to move.
-LONG = ("preserving index3", "decaying", "decaying index3", "kappa", "composed 4")
-CONVERGING = long(["preserving", "consistent", *LONG], *LONG)
+LONG = (
+    "preserving index3", "decaying", "decaying index3", "kappa", "consistent", "composed 4"
+)  # fmt: skip
+CONVERGING = long(["preserving", *LONG], *LONG)
 
 
 @pytest.mark.parametrize("scheme", CONVERGING)
@@ -142,6 +144,7 @@ def test_the_start_moves_along_the_constraints():
         np.testing.assert_allclose(leaf, 0, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_gradients_of_a_rigid_body():
     system, start, args = problem("body")
 
@@ -170,7 +173,11 @@ def test_gradients_of_a_rigid_body():
     np.testing.assert_allclose(differences, reverse, rtol=1e-5)
 
 
-@pytest.mark.parametrize("derivative", [ej.Gonzalez(), ej.MeanValue()], ids=["1", "2"])
+@pytest.mark.parametrize(
+    "derivative",
+    [ej.Gonzalez(), pytest.param(ej.MeanValue(), marks=pytest.mark.slow)],
+    ids=["1", "2"],
+)
 def test_gradients_stay_finite_at_rest(derivative):
     """In equilibrium every increment is zero, where a discrete gradient divides by it."""
     system, _, args = problem("pendulum")

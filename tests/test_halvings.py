@@ -86,6 +86,7 @@ def test_derivatives_run_through_the_parts():
     assert slope == pytest.approx(difference, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_damped_driven_step_keeps_its_balance_in_parts():
     """Time passes through the parts, and work adds up over them."""
 

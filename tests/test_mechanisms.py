@@ -91,7 +91,7 @@ PARALLEL = {
 @pytest.mark.parametrize(
     ("cells", "scheme", "h", "t", "bound"),
     [
-        (2, "preserving", 0.01, 1.0, 5e-3),
+        pytest.param(2, "preserving", 0.01, 1.0, 5e-3, marks=pytest.mark.slow),
         pytest.param(2, "composed 4", 0.01, 10.0, 1e-6, marks=pytest.mark.slow),
         pytest.param(40, "preserving", 0.01, 1.0, 5e-3, marks=pytest.mark.slow),
         # At h = 0.01 a step across a singular pose fails at t = 3.2.

@@ -7,7 +7,7 @@ import pytest
 
 import enerjax as ej
 
-from .helpers import on_host, problem
+from .helpers import long, on_host, problem
 from .references import HEAVY_TOP
 
 
@@ -121,7 +121,7 @@ def _top(name, h, steps=200, save_every=1):
     return run, vertical, spin
 
 
-@pytest.mark.parametrize("name", TOPS)
+@pytest.mark.parametrize("name", long(TOPS, "top", "top canonical"))
 def test_tops_keep_energy_and_what_their_coordinates_show(name):
     run, vertical, spin = _top(name, 1e-3)
     coarse, coarse_vertical, coarse_spin = _top(name, 2e-3, 100)

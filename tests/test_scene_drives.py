@@ -137,11 +137,12 @@ def test_drives_lead_points_along_their_paths():
     assert np.max(np.abs(leak)) <= 1e-11
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "body",
     [
         ej.bodies.RigidBody,
-        pytest.param(ej.bodies.QuaternionBody, marks=pytest.mark.slow),
+        ej.bodies.QuaternionBody,
     ],
 )
 def test_a_hinge_in_space_is_driven_over_full_turns(body):

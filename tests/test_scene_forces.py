@@ -102,11 +102,12 @@ def test_dampers_have_the_power_that_they_say():
     assert float(power) == pytest.approx(-2.0 * float(rate) ** 2, rel=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "body",
     [
         ej.bodies.RigidBody,
-        pytest.param(ej.bodies.QuaternionBody, marks=pytest.mark.slow),
+        ej.bodies.QuaternionBody,
     ],
 )
 def test_a_hinge_with_a_damper_in_space_slows_down_exponentially(body):

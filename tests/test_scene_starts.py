@@ -68,11 +68,12 @@ def test_velocities_that_no_joint_allows_are_refused():
     np.testing.assert_allclose(rounded, [0.0, 1.0075, 2.015], rtol=0, atol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "body",
     [
         ej.bodies.RigidBody,
-        pytest.param(ej.bodies.QuaternionBody, marks=pytest.mark.slow),
+        ej.bodies.QuaternionBody,
     ],
 )
 def test_starts_in_space(body):
@@ -117,6 +118,7 @@ def test_reports_are_of_the_time_and_the_numbers_that_are_asked_for():
         late.start(t=0.25)
 
 
+@pytest.mark.slow
 def test_reactions_in_an_equilibrium_and_in_a_batch():
     load = Point("load", 2.0, [0.3, -1.0])
     own = ej.joints.Constraint("own", lambda view, args: view.position("free")[:1])

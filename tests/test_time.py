@@ -21,12 +21,13 @@ def reach(numbers, scheme):
     return run.ys.q[-1] @ jnp.array([1.0, 0.3]) + run.audit.drive_work.sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "scheme",
     [
         ej.EnergyPreserving(),
-        pytest.param(ej.EnergyDecaying(0.5), marks=pytest.mark.slow),
-        pytest.param(ej.EnergyConsistent(0.5), marks=pytest.mark.slow),
+        ej.EnergyDecaying(0.5),
+        ej.EnergyConsistent(0.5),
     ],
     ids=lambda scheme: type(scheme).__name__,
 )
