@@ -177,7 +177,7 @@ def solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array
 # Errors of an inverse beyond which it is computed afresh, and which are small enough for a
 # chord iteration to gain as many digits at a time.
 _FAR = 0.5
-_ENOUGH = 1e-5
+_ENOUGH = 1e-7
 
 
 def _product(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n m"]:

@@ -29,14 +29,7 @@ from jaxtyping import Array, Float
 from .._discrete import AbstractDerivative
 from .._linear import Assembled, RowPattern, Symmetric
 from .._system import AbstractSystem, State
-from .._types import (
-    Args,
-    Coordinates,
-    JointMultipliers,
-    Multipliers,
-    Scalar,
-    Velocities,
-)
+from .._types import Args, Coordinates, JointMultipliers, Multipliers, Scalar, Velocities
 from .interval import Drive, Increment, lapse_of, Scales, Time
 
 

@@ -12,13 +12,7 @@ from .._energies import Energies
 from .._model import AbstractModel, Drive, Increment, Time
 from .._results import RESULTS
 from .._system import State
-from .._types import (
-    Coordinates,
-    JointMultipliers,
-    Multipliers,
-    Scalar,
-    Velocities,
-)
+from .._types import Coordinates, JointMultipliers, Multipliers, Scalar, Velocities
 
 
 # The levels at which joints are held: positions and velocities, stabilised as by Gear,
