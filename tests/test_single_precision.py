@@ -65,5 +65,5 @@ def test_derivatives_in_single_precision():
     single = jax.grad(tip)(jnp.float32(9.81), jnp.float32)
     double = jax.grad(tip)(9.81, jnp.float64)
     assert single.dtype == jnp.float32
-    # Round-off of fifty steps.
-    np.testing.assert_allclose(single, double, rtol=50 * EPS)
+    # Round-off of positions of size one; the derivative itself happens to be small.
+    np.testing.assert_allclose(single, double, rtol=0, atol=5 * EPS)
