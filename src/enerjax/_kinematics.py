@@ -10,14 +10,24 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from ._linear import inverse
+from ._linear import constant_entries, jacobian_pattern, Parts, parts_of, solve_parts
 from ._types import Args, Coordinates, Velocities
 
 
 class AbstractKinematics(eqx.Module):
     """The map `L(q)` from rates of coordinates to velocities, `nv x nq`."""
+
+    @abc.abstractmethod
+    def parts(
+        self,
+        q: Coordinates,
+        coordinate: Callable[[Coordinates], Float[Array, " ncc"]],
+        args: Args,
+    ) -> Parts | None:
+        """The independent blocks of `L` over `B_c`, if there are any; for `lift`."""
 
     @abc.abstractmethod
     def push(self, q: Coordinates, rate: Coordinates, args: Args) -> Velocities:
@@ -34,6 +44,7 @@ class AbstractKinematics(eqx.Module):
         v: Velocities,
         coordinate_jacobian: Callable[[Coordinates], Float[Array, "ncc nq"]],
         args: Args,
+        parts: Parts | None,
     ) -> Coordinates:
         """`L(q)^+ v`"""
 
@@ -47,13 +58,16 @@ class AbstractKinematics(eqx.Module):
 class IdentityKinematics(AbstractKinematics):
     """`v = qdot`: point masses, minimal coordinates with constant inertia."""
 
+    def parts(self, q, coordinate, args):
+        return None
+
     def push(self, q, rate, args):
         return rate
 
     def pull(self, q, momentum, args):
         return momentum
 
-    def lift(self, q, v, coordinate_jacobian, args):
+    def lift(self, q, v, coordinate_jacobian, args, parts):
         return v
 
     def gyroscopic(self, q, momentum, dq, args):
@@ -71,9 +85,17 @@ class ConfigurationKinematics(AbstractKinematics):
     def pull(self, q, momentum, args):
         return momentum @ self.matrix(q, args)
 
-    def lift(self, q, v, coordinate_jacobian, args):
+    def parts(self, q, coordinate, args):
+        of_rates = constant_entries(lambda inputs: self.matrix(*inputs), (q, args))
+        relations = jacobian_pattern(lambda q: coordinate(q), q)
+        if of_rates is None or relations is None:
+            return None
+        of_relations = np.where(relations.toarray(), np.nan, 0)
+        return parts_of(np.concatenate([of_rates, of_relations]))
+
+    def lift(self, q, v, coordinate_jacobian, args, parts):
         square = jnp.concatenate([self.matrix(q, args), coordinate_jacobian(q)])
-        return inverse(square)[:, : v.size] @ v
+        return solve_parts(parts, square, jnp.pad(v, (0, q.size - v.size)))
 
     def gyroscopic(self, q, momentum, dq, args):
         # G_ij = sum_k mu_k (dL_ki/dq_j - dL_kj/dq_i), paper eq. (11), applied to dq:

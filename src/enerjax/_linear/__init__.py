@@ -26,5 +26,11 @@ from .jacobian import (
     RowPattern as RowPattern,
 )
 from .norms import largest as largest
+from .parts import (
+    constant_entries as constant_entries,
+    Parts as Parts,
+    parts_of as parts_of,
+    solve_parts as solve_parts,
+)
 from .pattern import jacobian_pattern as jacobian_pattern, LARGE as LARGE
 from .symmetric import cholesky as cholesky, eigh as eigh

@@ -38,7 +38,7 @@ def _inverse_jvp(primals, tangents):
     y = inverse(x)
     if x.shape[0] > SMALL:
         return y, -y @ dx @ y
-    return y, -_product(_product(y, dx), y)
+    return y, -product(product(y, dx), y)
 
 
 @jax.jit
@@ -112,7 +112,7 @@ class Inverse(AbstractFactors):
     def renewed(self, matrix: Float[Array, "n n"]) -> "Inverse":
         sizes = jnp.max(jnp.abs(matrix), axis=1)
         matrix = matrix / sizes[:, None]
-        defect = jnp.eye(matrix.shape[0], dtype=matrix.dtype) - _product(
+        defect = jnp.eye(matrix.shape[0], dtype=matrix.dtype) - product(
             matrix, self.inverse
         )
 
@@ -122,11 +122,11 @@ class Inverse(AbstractFactors):
 
         def turn(carry):
             x, e, _ = carry
-            square = _product(e, e)
+            square = product(e, e)
             # What this leaves need not be formed where it is known to be enough.
             left = _row_sum(e) * _row_sum(square)
-            x = x + _product(x, e + square)
-            e = jax.lax.cond(left > _ENOUGH, lambda: _product(e, square), lambda: square)
+            x = x + product(x, e + square)
+            e = jax.lax.cond(left > _ENOUGH, lambda: product(e, square), lambda: square)
             return x, e, left
 
         def is_lost(carry) -> Flag:
@@ -180,7 +180,7 @@ _FAR = 0.5
 _ENOUGH = 1e-7
 
 
-def _product(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n m"]:
+def product(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n m"]:
     """A matrix product that XLA fuses with its surroundings, unlike `a @ b`."""
     if a.shape[1] <= _SUMMED:
         return jnp.sum(a[:, :, None] * b[None], axis=1)

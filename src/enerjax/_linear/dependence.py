@@ -139,6 +139,13 @@ def _added(primitive: Any, values: list[Value], params: Any, avals: Any) -> list
     return [_rows(operand, width) + joined]
 
 
+def _within(primitive: Any, values: list[Value], params: Any, avals: Any) -> list:
+    """What goes on within each part along the first axis stays there."""
+    (value,) = values
+    part = np.arange(_entries(value)) // int(np.prod(value.shape[1:], dtype=int))
+    return [_gathered(value.rows, part, value.shape[0])[part]]
+
+
 def _product(primitive: Any, values: list[Value], params: Any, avals: Any) -> list:
     """`dot_general`: each side united along what is summed over, and repeated beside the
     free axes of the other."""
@@ -214,4 +221,5 @@ RULES: dict[str, Callable] = {
     "reduce_prod": _summed,
     "scatter-add": _added,
     "dot_general": _product,
+    "jit enerjax_inverses": _within,
 }

@@ -52,8 +52,9 @@ def _identity(size: int) -> csr_array:
 def _equation(equation: Any, values: list[Value]) -> list[Value]:
     primitive, params = equation.primitive, equation.params
     avals = [var.aval for var in equation.outvars]
+    named = RULES.get(f"jit {params.get('name')}")
     inner = next((params[k] for k in ("jaxpr", "call_jaxpr") if k in params), None)
-    if inner is not None and primitive.name in _CALLS:
+    if named is None and inner is not None and primitive.name in _CALLS:
         consts = inner.consts if isinstance(inner, ClosedJaxpr) else []
         return interpret(getattr(inner, "jaxpr", inner), consts, values, _equation)
     if not any(isinstance(v, Depends) for v in values):
@@ -64,7 +65,7 @@ def _equation(equation: Any, values: list[Value]) -> list[Value]:
         return list(map(Constant, avals))  # truth values and indices have no derivative
     if primitive.name in _ZERO:
         return list(map(Constant, avals))
-    rule = RULES.get(primitive.name, everything)
+    rule = named or RULES.get(primitive.name, everything)
     rows = rule(primitive, values, params, avals)
     return [Depends(r, aval) for r, aval in zip(rows, avals, strict=True)]
 

@@ -22,6 +22,7 @@ from .._linear import (
     as_dense,
     Assembled,
     inverse_of,
+    Parts,
     row_hessians,
     Symmetric,
 )
@@ -57,11 +58,14 @@ class SeparableModel(AbstractModel):
     scales: Scales
     # Asked of large systems only.
     is_weight: bool = eqx.field(static=True)
+    # Of the map from rates to velocities.
+    parts: Parts | None = eqx.field(static=True)
 
     def __init__(self, system: System, state: State, args: Args):
         self.system = system
         self.args = args
         self.is_weight = is_weight(system, state.q, args)
+        self.parts = system.kinematics.parts(state.q, self.coordinate, args)
         self.inertia = system.inertia(state, args)
         self.inverse_inertia = inverse_of(self.inertia)
         self.scales = self._scales(state)
@@ -126,7 +130,8 @@ class SeparableModel(AbstractModel):
         return self.system.kinematics.pull(q, momentum, self.args)
 
     def lift(self, q: Coordinates, v: Velocities) -> Coordinates:
-        return self.system.kinematics.lift(q, v, jax.jacfwd(self.coordinate), self.args)
+        relations = jax.jacfwd(self.coordinate)
+        return self.system.kinematics.lift(q, v, relations, self.args, self.parts)
 
     def drive(
         self,
