@@ -20,6 +20,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from .dense import AbstractFactors
 from .dependence import shape_of
+from .elimination import LIBRARY, pivot_rows_first
 
 
 class Band:
@@ -58,7 +59,8 @@ class Band:
 
     def worth_it(self) -> bool:
         """Whether its elimination is less work than that of the dense matrix."""
-        return 40 * self.num_blocks * self.width**3 < self.size**3
+        part = 40 if self.width < LIBRARY else 8
+        return part * self.num_blocks * self.width**3 < self.size**3
 
     def empty(self, size: int, dtype: Any) -> "BandFactors":
         """Factors of no matrix yet."""
@@ -124,8 +126,8 @@ class BandFactors(AbstractFactors):
             whole = jnp.concatenate(
                 [jnp.concatenate([left, none], axis=1), rows]
             )  # two_widths, three_widths
-            turned, turn = _pivot_rows_first(whole, width)
-            return turned[width:, width:], (turn, turned[:width, width:])
+            turned, turn = pivot_rows_first(whole, width)
+            return turned[width:], (turn, turned[:width])
 
         first = matrix[0, :, width:]
         _, (turns, upper) = jax.lax.scan(eliminate, first, following)
@@ -152,32 +154,3 @@ class BandFactors(AbstractFactors):
         after = jnp.concatenate([none, none])
         _, x = jax.lax.scan(backward, after, (self.upper, reduced), reverse=True)
         return x.ravel()[band.back]
-
-
-def _pivot_rows_first(rows: Float[Array, "m w"], count: int) -> tuple[Array, Array]:
-    """Rows reduced so that the first `count` columns are those of the identity.
-
-    By Gauss-Jordan elimination with row pivoting; also returns the matrix that does it.
-    """
-    num_rows, num_columns = rows.shape
-    whole = jnp.concatenate([rows, jnp.eye(num_rows, dtype=rows.dtype)], axis=1)
-    numbers, counted = jnp.arange(num_rows), jnp.arange(count)
-
-    def column(k, carry):
-        whole, free, places = carry
-        entries = whole[:, k]
-        pivot = jnp.argmax(jnp.where(free, jnp.abs(entries), -1))
-        chosen = numbers == pivot
-        row = whole[pivot] / entries[pivot]
-        factors = jnp.where(chosen, 0, entries)
-        whole = jnp.where(chosen[:, None], row[None], whole - factors[:, None] * row[None])
-        return whole, free & ~chosen, jnp.where(counted == k, pivot, places)
-
-    carry = whole, jnp.ones((num_rows,), bool), jnp.zeros((count,), numbers.dtype)
-    whole, free, places = jax.lax.fori_loop(0, count, column, carry)
-    # What is left, in its order: the row of the first, second, ... that is free.
-    number_of = jnp.where(free, jnp.cumsum(free), 0)
-    left = jnp.arange(1, num_rows - count + 1)
-    rest = jnp.argmax(number_of[None, :] == left[:, None], axis=1)
-    whole = whole[jnp.concatenate([places, rest])]
-    return whole[:, :num_columns], whole[:, num_columns:]

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.sparse import csr_array, vstack
 
 from .._tracing import evaluate
+from .moves import MOVES
 
 
 class Depends:
@@ -92,16 +93,16 @@ def _moved(primitive: Any, values: list[Value], params: Any, avals: Any) -> list
     for k, value in enumerate(values):
         if k in indices:
             continue
-        numbers = jnp.zeros(np.shape(value), jnp.result_type(float))
+        numbers = np.zeros(np.shape(value))
         if k in moving:
-            numbers = (first + jnp.arange(_entries(value))).reshape(value.shape)
-            numbers = numbers.astype(float)
+            numbers = (first + np.arange(_entries(value), dtype=float)).reshape(value.shape)
             parts.append(value.rows)
             first += _entries(value)
         operands[k] = numbers
     blank = csr_array((1, _width(values)), dtype=bool)
     table = csr_array(vstack([blank, *parts]))
-    outs = evaluate(primitive, operands, params)
+    move = MOVES.get(primitive.name)
+    outs = move(*operands, **params) if move else evaluate(primitive, operands, params)
     return [table[np.nan_to_num(np.asarray(out)).astype(int).ravel()] for out in outs]
 
 

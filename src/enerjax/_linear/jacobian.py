@@ -9,22 +9,37 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, PyTree
+from scipy.sparse import csr_array
 
 from .banded import Band, coloured_products, column_colours
 from .dense import AbstractFactors, Inverse, LU, SMALL, solve
+from .dependence import shape_of
 from .dots import plain_products
 from .given import KLU, LineaxFactors, Scattered
 from .pattern import jacobian_pattern, LARGE
 
 
 class Full:
-    """A matrix that is stored as one array."""
+    """A matrix that is stored as one array.
 
-    def __init__(self, solver: lx.AbstractLinearSolver | None):
+    Where its pattern is known, columns that share no row are found together.
+    """
+
+    def __init__(
+        self, solver: lx.AbstractLinearSolver | None, pattern: csr_array | None = None
+    ):
         self.solver = solver
+        self._colours = None
+        if pattern is None:
+            return
+        self._colours = column_colours(pattern, np.arange(shape_of(pattern)[1]))
+        self._filled = pattern.toarray()
 
     def evaluate(self, fn: Callable[[Array], Array], x: Float[Array, " n"]) -> Array:
-        return jax.jacfwd(fn)(x)
+        if self._colours is None:
+            return jax.jacfwd(fn)(x)
+        columns = coloured_products(fn, x, self._colours)[self._colours]
+        return jnp.where(self._filled, columns.T, 0)
 
     def empty(self, size: int, dtype: Any) -> AbstractFactors:
         if self.solver is None:
@@ -116,17 +131,15 @@ def linearisable(
     value = plain_products(fn, like, args)
     if isinstance(linear_solver, lx.AbstractLinearSolver):
         return Linearisable(value, Full(linear_solver), fill)
-    full = Linearisable(value, Full(None), fill)
-    if like.size <= LARGE:
-        return full
     filled = value if fill is None else lambda x: value(x) + fill * x
-    pattern = jacobian_pattern(filled, like)
+    pattern = jacobian_pattern(filled, like) if like.size > LARGE else None
     if pattern is None:
-        return full
+        return Linearisable(value, Full(None), fill)
     if isinstance(linear_solver, KLU):
         return Linearisable(value, Scattered(pattern), fill)
     band = Band(pattern)
-    return Linearisable(value, band, fill) if band.worth_it() else full
+    form = band if band.worth_it() else Full(None, pattern)
+    return Linearisable(value, form, fill)
 
 
 def affine_root(
