@@ -123,27 +123,24 @@ def test_no_rule_is_missing_and_the_points_are_interchangeable(name):
     np.testing.assert_allclose(forth, back, rtol=1e-12, atol=1e-13)  # round-off
 
 
+def with_derivative(function):
+    """The derivative and the value, from one program."""
+    return jax.jacfwd(lambda x: (function(x),) * 2, has_aux=True)
+
+
 @pytest.mark.parametrize("name", long(FUNCTIONS, "solve", "determinant", "inverse"))
 def test_at_one_point_it_is_the_gradient_and_half_the_hessian(name):
     function = FUNCTIONS[name]
     gradient = lambda b: ej.discrete_grad(function)(POINT, b)
-    exact = jax.grad(function)
-
-    @jax.jit
-    def derivatives(b):
-        return (
-            (gradient(b), exact(b)),
-            0.5 * jax.jacfwd(exact)(b),
-            (jax.jacfwd(gradient)(b), jax.jacrev(gradient)(b)),
-            jax.jacfwd(jax.jacfwd(gradient))(b),
-        )
-
-    first, half, (forward, reverse), second = derivatives(POINT)
+    twice, exact = with_derivative(with_derivative(gradient)), jax.grad(function)
+    all_of_them = jax.jit(lambda b: (twice(b), jax.jacrev(gradient)(b)))
+    ((second, _), (forward, value)), reverse = all_of_them(POINT)
+    hessian, limit = jax.jit(with_derivative(exact))(POINT)
     # Round-off, with the curvature of the function.
     close = functools.partial(np.testing.assert_allclose, rtol=1e-10, atol=1e-10)
-    close(*first)
-    close(forward, half)
-    close(reverse, half)
+    close(value, limit)
+    close(forward, 0.5 * hessian)
+    close(reverse, 0.5 * hessian)
     assert jnp.all(jnp.isfinite(second))
 
 

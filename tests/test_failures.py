@@ -171,9 +171,7 @@ def test_a_failed_lane_leaves_the_others_unchanged():
     assert np.all(np.asarray(others.result == ej.RESULTS.successful))
     for lane in (0, 2):
         # Solver: Newton waits for the slowest lane.
-        np.testing.assert_allclose(
-            batch.ys.q[lane], others.ys.q[lane], rtol=0, atol=1e-10
-        )
+        np.testing.assert_allclose(batch.ys.q[lane], others.ys.q[lane], rtol=0, atol=1e-10)
         np.testing.assert_allclose(
             batch.audit.dissipated[lane], others.audit.dissipated[lane], rtol=0, atol=1e-10
         )

@@ -219,7 +219,7 @@ def test_numbers_that_the_functions_close_over_count():
     def tip(g):
         rod = lambda q, args: jnp.array([q @ q - 1.0])
         system = ej.System(jnp.eye(2), lambda q, args: -g * q[1], rod)
-        start = ej.initial_state(system, [1.0, 0.0], [0.0, 0.0])
+        start = ej.State([1.0, 0.0], [0.0, 0.0])
         run = ej.simulate(system, ej.EnergyPreserving(), start, h=0.01, num_steps=20)
         return run.ys.q[-1, 0]
 

@@ -1,6 +1,7 @@
 """The identity of the chain rule on random programs over all rules."""
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -145,29 +146,31 @@ def _defect(function, silent, a, b):
     return jnp.abs(change - (value(b) - value(a))) / unit
 
 
-def _check(steps, point, increment):
-    for dtype in (jnp.float64, jnp.float32):
+def _check(steps, point):
+    program = build(steps)
+    for dtype, increment in itertools.product((jnp.float64, jnp.float32), INCREMENTS):
         a = jnp.asarray(point[:SIZE], dtype)
         b = a + jnp.asarray(increment, dtype) * jnp.asarray(point[SIZE:], dtype)
         silent = jnp.zeros((len(steps), 2), dtype)
-        assert _defect(build(steps), silent, a, b) <= 50
+        assert _defect(program, silent, a, b) <= 50, increment
+    # A process can map only so many of them, and no other example has this one.
+    _defect.clear_cache()
 
 
 PROGRAMS = dict(
     steps=st.lists(STEP, min_size=1, max_size=6),
     point=st.lists(st.floats(-2, 2, width=16), min_size=2 * SIZE, max_size=2 * SIZE),
-    increment=st.sampled_from(INCREMENTS),
 )
 
 
-@settings(max_examples=15, deadline=None, derandomize=True, database=None)
+@settings(max_examples=10, deadline=None, derandomize=True, database=None)
 @given(**PROGRAMS)
-def test_the_identity_holds_on_random_programs(steps, point, increment):
-    _check(steps, point, increment)
+def test_the_identity_holds_on_random_programs(steps, point):
+    _check(steps, point)
 
 
 @pytest.mark.slow
 @settings(max_examples=500, deadline=None, derandomize=True, database=None)
 @given(**PROGRAMS)
-def test_the_identity_holds_on_many_random_programs(steps, point, increment):
-    _check(steps, point, increment)
+def test_the_identity_holds_on_many_random_programs(steps, point):
+    _check(steps, point)
