@@ -132,15 +132,14 @@ def with_derivative(function):
 def test_at_one_point_it_is_the_gradient_and_half_the_hessian(name):
     function = FUNCTIONS[name]
     gradient = lambda b: ej.discrete_grad(function)(POINT, b)
-    twice, exact = with_derivative(with_derivative(gradient)), jax.grad(function)
-    all_of_them = jax.jit(lambda b: (twice(b), jax.jacrev(gradient)(b)))
-    ((second, _), (forward, value)), reverse = all_of_them(POINT)
-    hessian, limit = jax.jit(with_derivative(exact))(POINT)
+    twice = jax.jit(with_derivative(with_derivative(gradient)))
+    (second, _), (forward, value) = twice(POINT)
+    hessian, limit = jax.jit(with_derivative(jax.grad(function)))(POINT)
     # Round-off, with the curvature of the function.
     close = functools.partial(np.testing.assert_allclose, rtol=1e-10, atol=1e-10)
     close(value, limit)
     close(forward, 0.5 * hessian)
-    close(reverse, 0.5 * hessian)
+    close(jax.jit(jax.jacrev(gradient))(POINT), 0.5 * hessian)
     assert jnp.all(jnp.isfinite(second))
 
 
@@ -239,22 +238,3 @@ def test_unlike_or_complex_points_are_refused():
         ej.discrete_grad(function)(POINT.astype(complex), POINT.astype(complex))
     with pytest.raises(TypeError, match="scalar"):
         ej.discrete_grad(jnp.sin)(POINT, POINT)
-
-
-@pytest.mark.slow
-def test_the_preserving_scheme_keeps_angular_momentum_with_it():
-    system, start, args = ej.problems.four_particles()
-
-    def drift(derivative):
-        scheme = ej.EnergyPreserving(derivative=derivative)
-        run = ej.simulate(system, scheme, start, args, h=0.01, num_steps=300)
-        x, v = (y.reshape(-1, 4, 3) for y in (run.ys.q, run.ys.v))
-        momentum = jnp.sum(args["m"][None, :, None] * jnp.cross(x, v), axis=1)
-        energy = run.audit.energy
-        size = lambda x: jnp.max(jnp.abs(x))
-        return size(momentum - momentum[:1]), size(energy - energy[0])
-
-    momentum, energy = drift(ej.ChainRule())
-    assert momentum <= 1e-12  # round-off of 300 steps, against |L| = 2.8
-    assert energy <= 1e-12  # likewise, against 1.2
-    assert drift(ej.Gonzalez())[0] > 1e-7  # its error is a truncation

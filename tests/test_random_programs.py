@@ -154,7 +154,7 @@ def _check(steps, point):
         silent = jnp.zeros((len(steps), 2), dtype)
         assert _defect(program, silent, a, b) <= 50, increment
     # A process can map only so many of them, and no other example has this one.
-    _defect.clear_cache()
+    _defect.clear_cache()  # pyright: ignore[reportAttributeAccessIssue]
 
 
 PROGRAMS = dict(
