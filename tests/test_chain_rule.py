@@ -107,32 +107,40 @@ def _defect(function, a, b):
 @pytest.mark.parametrize("name", [*FUNCTIONS, *HOLES])
 def test_the_identity_holds_at_every_increment(name):
     function = (FUNCTIONS | HOLES)[name]
-    defect = jax.jit(lambda b: _defect(function, POINT, b))
+    # Both points are arguments, as in a step: XLA evaluates functions of constants itself,
+    # some by other approximations, and equal points would not give equal values.
+    defect = jax.jit(lambda a, b: _defect(function, a, b))
     for increment in INCREMENTS:
-        assert defect(POINT + increment * DIRECTION) <= 50, increment  # round-off
+        assert defect(POINT, POINT + increment * DIRECTION) <= 50, increment  # round-off
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_no_rule_is_missing_and_the_points_are_interchangeable(name):
     function, b = FUNCTIONS[name], POINT + DIRECTION
     assert ej.discrete_fallbacks(function)(POINT, b) == []
-    forth = ej.discrete_grad(function)(POINT, b)
-    back = ej.discrete_grad(function)(b, POINT)
+    gradient = jax.jit(ej.discrete_grad(function))
+    forth, back = gradient(POINT, b), gradient(b, POINT)
     np.testing.assert_allclose(forth, back, rtol=1e-12, atol=1e-13)  # round-off
+
+
+def with_derivative(function):
+    """The derivative and the value, from one program."""
+    return jax.jacfwd(lambda x: (function(x),) * 2, has_aux=True)
 
 
 @pytest.mark.parametrize("name", long(FUNCTIONS, "solve", "determinant", "inverse"))
 def test_at_one_point_it_is_the_gradient_and_half_the_hessian(name):
     function = FUNCTIONS[name]
     gradient = lambda b: ej.discrete_grad(function)(POINT, b)
-    exact = jax.grad(function)
+    twice = jax.jit(with_derivative(with_derivative(gradient)))
+    (second, _), (forward, value) = twice(POINT)
+    hessian, limit = jax.jit(with_derivative(jax.grad(function)))(POINT)
     # Round-off, with the curvature of the function.
     close = functools.partial(np.testing.assert_allclose, rtol=1e-10, atol=1e-10)
-    close(gradient(POINT), exact(POINT))
-    half = 0.5 * jax.jacfwd(exact)(POINT)
-    close(jax.jacfwd(gradient)(POINT), half)
-    close(jax.jacrev(gradient)(POINT), half)
-    assert jnp.all(jnp.isfinite(jax.jacfwd(jax.jacfwd(gradient))(POINT)))
+    close(value, limit)
+    close(forward, 0.5 * hessian)
+    close(jax.jit(jax.jacrev(gradient))(POINT), 0.5 * hessian)
+    assert jnp.all(jnp.isfinite(second))
 
 
 def test_what_has_no_rule_is_listed():
@@ -203,10 +211,11 @@ def test_it_composes_with_the_transformations_of_jax():
     b = POINT + DIRECTION
     many = jnp.stack([b, b + 1, POINT])
     batched = jax.jit(jax.vmap(gradient, in_axes=(None, 0)))(POINT, many)
-    alone = jnp.stack([gradient(POINT, x) for x in many])
+    single = jax.jit(gradient)
+    alone = jnp.stack([single(POINT, x) for x in many])
     np.testing.assert_allclose(batched, alone, rtol=1e-12, atol=1e-14)
     total = lambda x: jnp.sum(jax.checkpoint(gradient)(POINT, x) ** 2)
-    forward, reverse = jax.jacfwd(total)(b), jax.grad(total)(b)
+    forward, reverse = jax.jit(lambda x: (jax.jacfwd(total)(x), jax.grad(total)(x)))(b)
     np.testing.assert_allclose(forward, reverse, rtol=1e-10, atol=1e-12)
     walked = jax.lax.scan(lambda c, x: (c + gradient(POINT, x), None), 0 * b, many)[0]
     np.testing.assert_allclose(walked, jnp.sum(alone, axis=0), rtol=1e-12, atol=1e-14)
@@ -229,22 +238,3 @@ def test_unlike_or_complex_points_are_refused():
         ej.discrete_grad(function)(POINT.astype(complex), POINT.astype(complex))
     with pytest.raises(TypeError, match="scalar"):
         ej.discrete_grad(jnp.sin)(POINT, POINT)
-
-
-@pytest.mark.slow
-def test_the_preserving_scheme_keeps_angular_momentum_with_it():
-    system, start, args = ej.problems.four_particles()
-
-    def drift(derivative):
-        scheme = ej.EnergyPreserving(derivative=derivative)
-        run = ej.simulate(system, scheme, start, args, h=0.01, num_steps=300)
-        x, v = (y.reshape(-1, 4, 3) for y in (run.ys.q, run.ys.v))
-        momentum = jnp.sum(args["m"][None, :, None] * jnp.cross(x, v), axis=1)
-        energy = run.audit.energy
-        size = lambda x: jnp.max(jnp.abs(x))
-        return size(momentum - momentum[:1]), size(energy - energy[0])
-
-    momentum, energy = drift(ej.ChainRule())
-    assert momentum <= 1e-12  # round-off of 300 steps, against |L| = 2.8
-    assert energy <= 1e-12  # likewise, against 1.2
-    assert drift(ej.Gonzalez())[0] > 1e-7  # its error is a truncation

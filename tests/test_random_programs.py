@@ -1,5 +1,8 @@
 """The identity of the chain rule on random programs over all rules."""
 
+import functools
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -125,9 +128,9 @@ def build(steps):
     return program
 
 
-def _defect(function, steps, a, b):
+@functools.partial(jax.jit, static_argnums=0)
+def _defect(function, silent, a, b):
     """The defect in units of what rounding every intermediate value once would do."""
-    silent = jnp.zeros((len(steps), 2), a.dtype)
     value = lambda x: function(x, silent)
     change = ej.discrete_jvp(value, a, b)(b - a)
     size = jnp.zeros((), a.dtype)
@@ -140,31 +143,34 @@ def _defect(function, steps, a, b):
     between = ej.discrete_grad(lambda inputs: function(*inputs))((a, silent), (b, silent))
     size += jnp.sum(jnp.abs(between[1])) + jnp.abs(between[0]) @ (jnp.abs(a) + jnp.abs(b))
     unit = jnp.finfo(a.dtype).eps * size + jnp.finfo(a.dtype).tiny
-    return float(jnp.abs(change - (value(b) - value(a))) / unit)
+    return jnp.abs(change - (value(b) - value(a))) / unit
 
 
-def _check(steps, point, increment):
-    for dtype in (jnp.float64, jnp.float32):
+def _check(steps, point):
+    program = build(steps)
+    for dtype, increment in itertools.product((jnp.float64, jnp.float32), INCREMENTS):
         a = jnp.asarray(point[:SIZE], dtype)
         b = a + jnp.asarray(increment, dtype) * jnp.asarray(point[SIZE:], dtype)
-        assert _defect(build(steps), steps, a, b) <= 50
+        silent = jnp.zeros((len(steps), 2), dtype)
+        assert _defect(program, silent, a, b) <= 50, increment
+    # A process can map only so many of them, and no other example has this one.
+    _defect.clear_cache()  # pyright: ignore[reportAttributeAccessIssue]
 
 
 PROGRAMS = dict(
     steps=st.lists(STEP, min_size=1, max_size=6),
     point=st.lists(st.floats(-2, 2, width=16), min_size=2 * SIZE, max_size=2 * SIZE),
-    increment=st.sampled_from(INCREMENTS),
 )
 
 
-@settings(max_examples=15, deadline=None, derandomize=True, database=None)
+@settings(max_examples=10, deadline=None, derandomize=True, database=None)
 @given(**PROGRAMS)
-def test_the_identity_holds_on_random_programs(steps, point, increment):
-    _check(steps, point, increment)
+def test_the_identity_holds_on_random_programs(steps, point):
+    _check(steps, point)
 
 
 @pytest.mark.slow
 @settings(max_examples=500, deadline=None, derandomize=True, database=None)
 @given(**PROGRAMS)
-def test_the_identity_holds_on_many_random_programs(steps, point, increment):
-    _check(steps, point, increment)
+def test_the_identity_holds_on_many_random_programs(steps, point):
+    _check(steps, point)

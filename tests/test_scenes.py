@@ -61,7 +61,7 @@ def test_numbers_are_found_and_set_by_name_and_differentiated():
     def tip(mass):
         return run(system, start, args.set("outer", mass=mass), 50).ys.q[-1, 3]
 
-    slope, h = jax.grad(tip)(1.0), 1e-4
+    slope, h = jax.jit(jax.grad(tip))(1.0), 1e-4
     difference = float(tip(1.0 + h) - tip(1.0 - h)) / (2 * h)
     assert float(slope) == pytest.approx(
         difference, rel=1e-6

@@ -1,5 +1,6 @@
 """Batches equal loops, and new numbers never compile anything."""
 
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -50,7 +51,7 @@ def compare(batch, number, solution):
 AXES = {"alpha": (0,), "h": (1,), "args": (2,), "start": (3, 4), "all": (0, 1, 2, 3, 4)}
 
 
-@pytest.mark.parametrize("swept", AXES)
+@pytest.mark.parametrize("swept", long(AXES, "alpha", "start"))
 def test_vmap_equals_a_loop(swept):
     numbers = lanes()
     in_axes = tuple(0 if i in AXES[swept] else None for i in range(5))
@@ -58,7 +59,7 @@ def test_vmap_equals_a_loop(swept):
     first = tuple(
         x if axis == 0 else x[0] for x, axis in zip(numbers, in_axes, strict=True)
     )
-    batch = eqx.filter_vmap(run, in_axes=(in_axes,))(first)
+    batch = eqx.filter_jit(eqx.filter_vmap(run, in_axes=(in_axes,)))(first)
     for k in range(3):
         one = tuple(pick(x, a, k) for x, a in zip(first, in_axes, strict=True))
         compare(batch, k, run(one))
@@ -67,7 +68,7 @@ def test_vmap_equals_a_loop(swept):
 @pytest.mark.parametrize("scheme", long(["consistent", "composed 4"], "composed 4"))
 def test_vmap_over_everything_equals_a_loop(scheme):
     numbers = lanes()
-    batch = eqx.filter_vmap(lambda x: run(x, scheme))(numbers)
+    batch = eqx.filter_jit(eqx.filter_vmap(lambda x: run(x, scheme)))(numbers)
     for k in range(3):
         compare(batch, k, run(tuple(x[k] for x in numbers), scheme))
 
@@ -161,30 +162,35 @@ def test_lanes_that_finish_early_do_not_move():
         assert np.max(difference) <= 1
 
 
+@jax.jit
+def three_steps(g, h):
+    system, start, args = problem("double")
+    run = ej.simulate(
+        system,
+        ej.EnergyPreserving(),
+        start,
+        args | dict(g=g),
+        h=h,
+        num_steps=3,
+        throw=False,
+    )
+    return run.ys.q[-1], run.stats.completed_steps
+
+
+@functools.cache
+def many_three_steps():
+    return jax.jit(jax.vmap(three_steps))
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_large_batch_with_a_broken_lane(bad):
     """Reductions over many lanes are other programs: they must not overlook a NaN."""
-    count, steps = 1500, 3
-    args = problem("double").args
-    start = problem("double").start
-
-    def end(g, h):
-        run = ej.simulate(
-            problem("double").system,
-            ej.EnergyPreserving(),
-            start,
-            args | dict(g=g),
-            h=h,
-            num_steps=steps,
-            throw=False,
-        )
-        return run.ys.q[-1], run.stats.completed_steps
-
+    count = 1500
     g = jnp.linspace(5.0, 15.0, count).at[700].set(bad)
     h = jnp.linspace(1e-3, 2e-3, count)
-    q, completed = jax.jit(jax.vmap(end))(g, h)
+    q, completed = many_three_steps()(g, h)
     healthy = np.arange(count) != 700
-    np.testing.assert_array_equal(completed, np.where(healthy, steps, 0))
+    np.testing.assert_array_equal(completed, np.where(healthy, 3, 0))
     np.testing.assert_array_equal(np.isfinite(q).all(axis=1), healthy)
     for lane in (0, 699, count - 1):
-        np.testing.assert_allclose(q[lane], jax.jit(end)(g[lane], h[lane])[0], **SAME)
+        np.testing.assert_allclose(q[lane], three_steps(g[lane], h[lane])[0], **SAME)
