@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
@@ -52,13 +52,13 @@ def parts_of(constants: Float[np.ndarray, "n n"]) -> Parts | None:
     graph = csr_array(entries, shape=(2 * size, 2 * size))
     count, labels = connected_components(graph, directed=False)
     labels = labels.reshape(2, size)
-    sizes = [np.bincount(x, minlength=count) for x in labels]
+    sizes, widths = (np.bincount(x, minlength=count) for x in labels)
     # A matrix with blocks that are not square is singular: that is for others to find.
-    if count == 1 or not np.array_equal(*sizes):
+    if count == 1 or np.any(sizes != widths):
         return None
     ones = np.zeros(count, bool)
     ones[labels[0][rows[constants[rows, columns] == 1]]] = True
-    return Parts(labels, ones & (sizes[0] == 1))
+    return Parts(labels, ones & (sizes == 1))
 
 
 def constant_entries(

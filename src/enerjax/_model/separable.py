@@ -18,14 +18,7 @@ from jaxtyping import Array, Float
 
 from .._discrete import AbstractCorrected, AbstractDerivative
 from .._kinematics import IdentityKinematics
-from .._linear import (
-    as_dense,
-    Assembled,
-    inverse_of,
-    Parts,
-    row_hessians,
-    Symmetric,
-)
+from .._linear import as_dense, Assembled, inverse_of, Parts, row_hessians, Symmetric
 from .._system import State, System
 from .._types import (
     Args,

@@ -1,0 +1,92 @@
+"""Matrices that fall apart into blocks: the maps from rates to velocities."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from enerjax import problems
+from enerjax._linear import constant_entries, parts_of, solve_parts
+from enerjax._model import make_model, SeparableModel
+
+
+# Two ones, one by one, two by two and three by three, rows and columns shuffled.
+SIZES = (1, 1, 1, 2, 3)
+RNG = np.random.default_rng(1)
+ROWS, COLUMNS = RNG.permutation(8), RNG.permutation(8)
+
+
+def block_matrix(ones=2):
+    whole, at = np.zeros((8, 8)), 0
+    for k, size in enumerate(SIZES):
+        part = slice(at, at + size)
+        whole[part, part] = RNG.normal(size=(size, size)) if k >= ones else 1
+        at += size
+    return whole[ROWS][:, COLUMNS]
+
+
+MATRIX = block_matrix()
+PARTS = parts_of(np.where((MATRIX == 0) | (MATRIX == 1), MATRIX, np.nan))
+RIGHT = RNG.normal(size=8)
+
+
+def test_blocks_are_found():
+    assert PARTS is not None
+    shapes = [(kind, rows.shape) for kind, rows, _ in PARTS.groups]
+    assert shapes == [(0, (2, 1)), (1, (1, 1)), (2, (1, 2)), (3, (1, 3))]
+
+
+def test_solutions_are_those_of_the_whole_matrix():
+    x = solve_parts(PARTS, jnp.asarray(MATRIX), jnp.asarray(RIGHT))
+    # Round-off, times the condition of the blocks.
+    error = np.max(np.abs(x - np.linalg.solve(MATRIX, RIGHT)))
+    assert error <= 1e-15 * np.linalg.cond(MATRIX) * np.max(np.abs(x))
+
+
+def test_derivatives_of_solutions():
+    change = np.where(MATRIX == 0, 0, RNG.normal(size=(8, 8)))
+    change = np.where(MATRIX == 1, 0, change)
+    solution = lambda parts: lambda s: solve_parts(parts, MATRIX + s * change, RIGHT + s)
+    of_parts, of_whole = solution(PARTS), solution(None)
+    for derivative in (jax.jacfwd, jax.jacrev, lambda f: jax.jacfwd(jax.jacrev(f))):
+        a, b = derivative(of_parts)(0.0), derivative(of_whole)(0.0)
+        # Round-off, times the square of the condition.
+        assert np.max(np.abs(a - b)) <= 1e-15 * np.linalg.cond(MATRIX) ** 2 * np.max(
+            np.abs(b)
+        )
+
+
+def test_a_matrix_in_one_piece_or_singular_has_no_parts():
+    assert parts_of(np.full((3, 3), np.nan)) is None
+    assert parts_of(np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])) is None
+
+
+def test_zeros_that_hold_only_here_are_no_constants():
+    def fn(inputs):
+        q, args = inputs
+        sometimes = jnp.where(q[0] > 5, q[0], 0)
+        return jnp.stack([sometimes, args["a"] * 0.0 + 1, jnp.zeros(()), jnp.ones(())])
+
+    constants = constant_entries(fn, (jnp.zeros(1), {"a": 2.0 * jnp.ones(())}))
+    assert constants is not None
+    np.testing.assert_array_equal(np.isnan(constants), [True, False, False, False])
+    np.testing.assert_array_equal(constants[1:], [1, 0, 1])
+
+
+@pytest.mark.parametrize("jit", [False, True])
+def test_a_body_in_euler_parameters_is_a_place_and_a_rotation(jit):
+    """The three entries of the place of the top are themselves."""
+    system, start, args = problems.heavy_top()
+    found = []
+
+    def look(start, args):
+        model = make_model(system, start, args)
+        assert isinstance(model, SeparableModel)
+        found.append(model.parts)
+        return start.q
+
+    (jax.jit(look) if jit else look)(start, args)
+    assert [(kind, rows.shape) for kind, rows, _ in found[0].groups] == [
+        (0, (3, 1)),
+        (4, (1, 4)),
+    ]
