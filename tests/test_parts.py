@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from enerjax import problems
-from enerjax._linear import constant_entries, parts_of, solve_parts
+from enerjax._kinematics import ConfigurationKinematics
+from enerjax._linear import constant_entries, multiply_parts, parts_of, solve_parts
 from enerjax._model import make_model, SeparableModel
 
 
@@ -41,6 +42,12 @@ def test_solutions_are_those_of_the_whole_matrix():
     # Round-off, times the condition of the blocks.
     error = np.max(np.abs(x - np.linalg.solve(MATRIX, RIGHT)))
     assert error <= 1e-15 * np.linalg.cond(MATRIX) * np.max(np.abs(x))
+
+
+def test_products_are_those_of_the_whole_matrix():
+    product = multiply_parts(PARTS, jnp.asarray(MATRIX), jnp.asarray(RIGHT))
+    # Round-off of three terms of order one.
+    np.testing.assert_allclose(product, MATRIX @ RIGHT, rtol=0, atol=4e-15)
 
 
 def test_derivatives_of_solutions():
@@ -82,7 +89,8 @@ def test_a_body_in_euler_parameters_is_a_place_and_a_rotation(jit):
     def look(start, args):
         model = make_model(system, start, args)
         assert isinstance(model, SeparableModel)
-        found.append(model.parts)
+        assert isinstance(model.kinematics, ConfigurationKinematics)
+        found.append(model.kinematics.parts)
         return start.q
 
     (jax.jit(look) if jit else look)(start, args)

@@ -13,7 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._linear import constant_entries, jacobian_pattern, Parts, parts_of, solve_parts
+from ._linear import (
+    constant_entries,
+    jacobian_pattern,
+    multiply_parts,
+    Parts,
+    parts_of,
+    solve_parts,
+)
 from ._types import Args, Coordinates, Velocities
 
 
@@ -21,13 +28,13 @@ class AbstractKinematics(eqx.Module):
     """The map `L(q)` from rates of coordinates to velocities, `nv x nq`."""
 
     @abc.abstractmethod
-    def parts(
+    def in_parts(
         self,
         q: Coordinates,
         coordinate: Callable[[Coordinates], Float[Array, " ncc"]],
         args: Args,
-    ) -> Parts | None:
-        """The independent blocks of `L` over `B_c`, if there are any; for `lift`."""
+    ) -> "AbstractKinematics":
+        """The same, knowing the independent blocks of `L` over `B_c`."""
 
     @abc.abstractmethod
     def push(self, q: Coordinates, rate: Coordinates, args: Args) -> Velocities:
@@ -44,7 +51,6 @@ class AbstractKinematics(eqx.Module):
         v: Velocities,
         coordinate_jacobian: Callable[[Coordinates], Float[Array, "ncc nq"]],
         args: Args,
-        parts: Parts | None,
     ) -> Coordinates:
         """`L(q)^+ v`"""
 
@@ -58,8 +64,8 @@ class AbstractKinematics(eqx.Module):
 class IdentityKinematics(AbstractKinematics):
     """`v = qdot`: point masses, minimal coordinates with constant inertia."""
 
-    def parts(self, q, coordinate, args):
-        return None
+    def in_parts(self, q, coordinate, args):
+        return self
 
     def push(self, q, rate, args):
         return rate
@@ -67,7 +73,7 @@ class IdentityKinematics(AbstractKinematics):
     def pull(self, q, momentum, args):
         return momentum
 
-    def lift(self, q, v, coordinate_jacobian, args, parts):
+    def lift(self, q, v, coordinate_jacobian, args):
         return v
 
     def gyroscopic(self, q, momentum, dq, args):
@@ -78,24 +84,34 @@ class ConfigurationKinematics(AbstractKinematics):
     """`v = L(q) qdot` with a user's function `L(q, args)`: bodies that rotate."""
 
     matrix: Callable[[Coordinates, Args], Float[Array, "nv nq"]]
+    # Of `L` over `B_c`.
+    parts: Parts | None = eqx.field(static=True, default=None)
 
-    def push(self, q, rate, args):
-        return self.matrix(q, args) @ rate
-
-    def pull(self, q, momentum, args):
-        return momentum @ self.matrix(q, args)
-
-    def parts(self, q, coordinate, args):
+    def in_parts(self, q, coordinate, args):
         of_rates = constant_entries(lambda inputs: self.matrix(*inputs), (q, args))
         relations = jacobian_pattern(lambda q: coordinate(q), q)
         if of_rates is None or relations is None:
-            return None
+            return self
         of_relations = np.where(relations.toarray(), np.nan, 0)
-        return parts_of(np.concatenate([of_rates, of_relations]))
+        parts = parts_of(np.concatenate([of_rates, of_relations]))
+        return ConfigurationKinematics(self.matrix, parts)
 
-    def lift(self, q, v, coordinate_jacobian, args, parts):
+    def push(self, q, rate, args):
+        matrix = self.matrix(q, args)
+        if self.parts is None:
+            return matrix @ rate
+        square = jnp.pad(matrix, ((0, q.size - len(matrix)), (0, 0)))
+        return multiply_parts(self.parts, square, rate)[: len(matrix)]
+
+    def pull(self, q, momentum, args):
+        if self.parts is None:
+            return momentum @ self.matrix(q, args)
+        _, pull = jax.vjp(lambda rate: self.push(q, rate, args), jnp.zeros_like(q))
+        return pull(momentum)[0]
+
+    def lift(self, q, v, coordinate_jacobian, args):
         square = jnp.concatenate([self.matrix(q, args), coordinate_jacobian(q)])
-        return solve_parts(parts, square, jnp.pad(v, (0, q.size - v.size)))
+        return solve_parts(self.parts, square, jnp.pad(v, (0, q.size - v.size)))
 
     def gyroscopic(self, q, momentum, dq, args):
         # G_ij = sum_k mu_k (dL_ki/dq_j - dL_kj/dq_i), paper eq. (11), applied to dq:

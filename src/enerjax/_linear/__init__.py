@@ -28,6 +28,7 @@ from .jacobian import (
 from .norms import largest as largest
 from .parts import (
     constant_entries as constant_entries,
+    multiply_parts as multiply_parts,
     Parts as Parts,
     parts_of as parts_of,
     solve_parts as solve_parts,

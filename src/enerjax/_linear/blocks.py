@@ -13,11 +13,12 @@ from scipy.sparse.csgraph import connected_components
 
 from .._tracing import is_known
 from .indices import Indices
-from .pattern import jacobian_pattern, LARGE
+from .pattern import jacobian_pattern
 
 
-# Rows of the largest block that counts as small.
+# Rows of the largest block that counts as small, and of a matrix that is not worth it.
 _BLOCK = 16
+_FEW = 24
 
 
 class Places(Indices):
@@ -104,7 +105,7 @@ def blocks_of(matrix: Symmetric) -> Float[Array, "blocks size size"]:
 def hessian(fn: Callable[[Array], Array], at: Float[Array, " n"]) -> Symmetric:
     """The Hessian of a scalar function; of blocks where it is large and falls apart."""
     gradient = jax.grad(fn)
-    pattern = jacobian_pattern(gradient, at) if at.size > LARGE else None
+    pattern = jacobian_pattern(gradient, at) if at.size > _FEW else None
     places = None if pattern is None else _places(pattern)
     if places is None:
         return jax.jacfwd(gradient)(at)
@@ -119,7 +120,7 @@ def hessian(fn: Callable[[Array], Array], at: Float[Array, " n"]) -> Symmetric:
 
 def in_blocks(matrix: Float[Array, "n n"]) -> Symmetric:
     """A given matrix; of blocks where it is large, known and falls apart."""
-    if matrix.shape[0] <= LARGE or not is_known(matrix):
+    if matrix.shape[0] <= _FEW or not is_known(matrix):
         return matrix
     places = _places(csr_array(np.asarray(matrix) != 0))
     if places is None:

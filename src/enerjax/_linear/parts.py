@@ -25,7 +25,7 @@ class Parts(Indices):
 
     - `groups`: for each size of blocks the rows and the columns of all of that size, two
       arrays of shape `(blocks, size)`; first, of size zero, those that are just a one.
-    - `back`: where each unknown is found in the solutions of all blocks.
+    - `of_rows`, `of_columns`: where each is found in the groups, one behind the other.
     """
 
     def __init__(self, labels: np.ndarray, is_one: np.ndarray):
@@ -38,7 +38,8 @@ class Parts(Indices):
         for kind in np.unique(kinds):
             entries = starts[kinds == kind][:, None] + np.arange(max(kind, 1))
             self.groups.append((kind, *(x[entries] for x in places)))
-        self.back = np.argsort(np.concatenate([c.ravel() for _, _, c in self.groups]))
+        sides = ([group[side].ravel() for group in self.groups] for side in (1, 2))
+        self.of_rows, self.of_columns = (np.argsort(np.concatenate(x)) for x in sides)
 
 
 def parts_of(constants: Float[np.ndarray, "n n"]) -> Parts | None:
@@ -92,9 +93,22 @@ def solve_parts(
         return inverse(matrix) @ right
     solutions = []
     for size, rows, columns in parts.groups:
-        part = _take(right, rows.ravel()).reshape(rows.shape)
+        part = _take(right, rows)
         solutions.append(_solve(_blocks(matrix, rows, columns), part) if size else part)
-    return _take(jnp.concatenate([x.ravel() for x in solutions]), parts.back)
+    return _joined(solutions, parts.of_columns)
+
+
+def multiply_parts(
+    parts: Parts | None, matrix: Float[Array, "n n"], x: Float[Array, " n"]
+) -> Float[Array, " n"]:
+    """`matrix @ x`: each row of what its block depends on, and on nothing else."""
+    if parts is None:
+        return matrix @ x
+    images = []
+    for size, rows, columns in parts.groups:
+        part = _take(x, columns)
+        images.append(_times(_blocks(matrix, rows, columns), part) if size else part)
+    return _joined(images, parts.of_rows)
 
 
 # Blocks that are cut out one by one.
@@ -110,10 +124,14 @@ def _blocks(matrix: Array, rows: np.ndarray, columns: np.ndarray) -> Array:
 
 def _take(x: Array, indices: np.ndarray) -> Array:
     """`x[indices]`, as a slice where it is one: XLA keeps that inside a loop."""
-    first, last = indices[0], indices[-1] + 1
-    if np.array_equal(indices, np.arange(first, last)):
-        return x[first:last]
+    first, last = indices.flat[0], indices.flat[-1] + 1
+    if np.array_equal(indices.ravel(), np.arange(first, last)):
+        return x[first:last].reshape(*indices.shape, *x.shape[1:])
     return x[indices]
+
+
+def _joined(pieces: list[Array], order: np.ndarray) -> Array:
+    return _take(jnp.concatenate([x.ravel() for x in pieces]), order)
 
 
 @jax.custom_jvp

@@ -23,7 +23,7 @@ def accelerations(model: "SeparableModel", state: State) -> tuple[Velocities, Mu
     q, v, t, scales = state.q, state.v, state.t, model.scales
     qdot = model.lift(q, v)
     slope = model.slope(state)
-    gyroscopic = model.system.kinematics.gyroscopic(q, model.inertia @ v, qdot, model.args)
+    gyroscopic = model.kinematics.gyroscopic(q, model.inertia @ v, qdot, model.args)
     if gyroscopic is not None:
         slope = slope + gyroscopic
     drift = _drift(model, state, qdot)

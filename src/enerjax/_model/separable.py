@@ -17,8 +17,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._discrete import AbstractCorrected, AbstractDerivative
-from .._kinematics import IdentityKinematics
-from .._linear import as_dense, Assembled, inverse_of, Parts, row_hessians, Symmetric
+from .._kinematics import AbstractKinematics, IdentityKinematics
+from .._linear import as_dense, Assembled, inverse_of, row_hessians, Symmetric
 from .._system import State, System
 from .._types import (
     Args,
@@ -51,14 +51,13 @@ class SeparableModel(AbstractModel):
     scales: Scales
     # Asked of large systems only.
     is_weight: bool = eqx.field(static=True)
-    # Of the map from rates to velocities.
-    parts: Parts | None = eqx.field(static=True)
+    kinematics: AbstractKinematics
 
     def __init__(self, system: System, state: State, args: Args):
         self.system = system
         self.args = args
         self.is_weight = is_weight(system, state.q, args)
-        self.parts = system.kinematics.parts(state.q, self.coordinate, args)
+        self.kinematics = system.kinematics.in_parts(state.q, self.coordinate, args)
         self.inertia = system.inertia(state, args)
         self.inverse_inertia = inverse_of(self.inertia)
         self.scales = self._scales(state)
@@ -69,7 +68,7 @@ class SeparableModel(AbstractModel):
 
     @property
     def has_canonical_rates(self) -> bool:
-        return isinstance(self.system.kinematics, IdentityKinematics)
+        return isinstance(self.kinematics, IdentityKinematics)
 
     def enter(self, state: State) -> State:
         return state
@@ -114,17 +113,17 @@ class SeparableModel(AbstractModel):
         return state.v
 
     def push(self, qa: Coordinates, qb: Coordinates, rate: Coordinates) -> Velocities:
-        return self.system.kinematics.push(0.5 * (qa + qb), rate, self.args)
+        return self.kinematics.push(0.5 * (qa + qb), rate, self.args)
 
     def pull(self, qa: Coordinates, qb: Coordinates, force: Velocities) -> Coordinates:
         return self._pull(0.5 * (qa + qb), force)
 
     def _pull(self, q: Coordinates, momentum: Velocities) -> Coordinates:
-        return self.system.kinematics.pull(q, momentum, self.args)
+        return self.kinematics.pull(q, momentum, self.args)
 
     def lift(self, q: Coordinates, v: Velocities) -> Coordinates:
         relations = jax.jacfwd(self.coordinate)
-        return self.system.kinematics.lift(q, v, relations, self.args, self.parts)
+        return self.kinematics.lift(q, v, relations, self.args)
 
     def drive(
         self,
@@ -175,9 +174,7 @@ class SeparableModel(AbstractModel):
         middle = 0.5 * (a.q + b.q)
         change = self._pull(middle, self.inertia @ (b.v - a.v))
         momentum = self.inertia @ (0.5 * (a.v + b.v))
-        gyroscopic = self.system.kinematics.gyroscopic(
-            middle, momentum, h * rate, self.args
-        )
+        gyroscopic = self.kinematics.gyroscopic(middle, momentum, h * rate, self.args)
         if gyroscopic is not None:
             change = change + gyroscopic
         return Drive(change + drive.impulse, drive.drift)
