@@ -1,4 +1,7 @@
-"""The nearest positions and velocities that satisfy the constraints."""
+"""The nearest positions and velocities that satisfy the constraints.
+
+Functions whose pattern is sought make their transposes inside: there indices are known.
+"""
 
 from collections.abc import Callable
 from typing import TypeAlias
@@ -33,10 +36,10 @@ def rank_of_constraints(model: AbstractModel, state: State) -> Count:
         jacobian = jax.jacfwd(constraint)(q)
         unit = jacobian / scales.coordinate[None, :] / scales.constraint[:, None]
         return jnp.linalg.matrix_rank(unit)
-    # A vector is found again from its product with `B B^T` only if that is regular.
-    _, transpose = jax.vjp(constraint, q)
 
+    # A vector is found again from its product with `B B^T` only if that is regular.
     def product(mu: Multipliers) -> Multipliers:
+        _, transpose = jax.vjp(constraint, q)
         motion = transpose(mu / scales.constraint)[0] / scales.coordinate**2
         return jax.jvp(constraint, (q,), (motion,))[1] / scales.constraint
 
@@ -110,13 +113,13 @@ def _linear(held: _Held, metric: Symmetric) -> Flag:
     infinitely far from a sphere it is a quarter.)
     """
     q, (unit, _), coordinate = held.given, held.scales(), held.model.scales.coordinate
-    _, transpose = jax.vjp(held, q)
 
     def correction(residual: Multipliers) -> Coordinates:
         """The shortest with this effect on the constraints."""
 
         def conditions(x: Array) -> Array:
             shift, mu = x[: q.size] / coordinate, x[q.size :] / unit
+            _, transpose = jax.vjp(held, q)
             change = jax.jvp(held, (q,), (shift,))[1] - residual
             force = metric @ shift + transpose(mu)[0]
             return jnp.concatenate([force / coordinate, change / unit])
@@ -145,8 +148,12 @@ def project_velocity(
 
     def correct(v: Velocities, held: Rows, unit: Array, fill: Array | None) -> Velocities:
         mobility = model.mobility(State(q, v))
-        rate, transpose = jax.vjp(held, v)
-        change = lambda mu: mobility @ transpose(mu / unit)[0]
+        rate = held(v)
+
+        def change(mu: Array) -> Velocities:
+            _, transpose = jax.vjp(held, v)
+            return mobility @ transpose(mu / unit)[0]
+
         remaining = lambda mu: (rate - jax.jvp(held, (v,), (change(mu),))[1]) / unit
         return v - change(affine_root(remaining, rate, fill))
 

@@ -27,11 +27,12 @@ def accelerations(model: "SeparableModel", state: State) -> tuple[Velocities, Mu
     if gyroscopic is not None:
         slope = slope + gyroscopic
     drift = _drift(model, state, qdot)
-    _, transpose = jax.vjp(lambda x: model.constraint(x, t), q)
     unit = 1 / jnp.sqrt(model.inertia.diagonal())
 
     def conditions(x: Array) -> Array:
         acceleration, multipliers = unit * x[: v.size], x[v.size :] / scales.constraint
+        # In here, where its indices are known, as the pattern needs them.
+        _, transpose = jax.vjp(lambda x: model.constraint(x, t), q)
         pulled = model.pull(q, q, model.inertia @ acceleration)
         pulled = pulled + transpose(multipliers)[0]
         rate = model.joint_change(q, acceleration, t) + drift
