@@ -121,10 +121,10 @@ class Inverse(AbstractFactors):
             return (size > _ENOUGH) & (size < _FAR)
 
         def turn(carry):
-            x, e, _ = carry
+            x, e, size = carry
             square = product(e, e)
             # What this leaves need not be formed where it is known to be enough.
-            left = _row_sum(e) * _row_sum(square)
+            left = size * _row_sum(square)
             x = x + product(x, e + square)
             e = jax.lax.cond(left > _ENOUGH, lambda: product(e, square), lambda: square)
             return x, e, left
