@@ -71,13 +71,16 @@ def test_a_matrix_in_one_piece_or_singular_has_no_parts():
 def test_zeros_that_hold_only_here_are_no_constants():
     def fn(inputs):
         q, args = inputs
-        sometimes = jnp.where(q[0] > 5, q[0], 0)
-        return jnp.stack([sometimes, args["a"] * 0.0 + 1, jnp.zeros(()), jnp.ones(())])
+        sometimes = jnp.where(q[0] > 5, q[0], 0), jnp.where(q[0] > 5, 1.0, 0.0)
+        by_steps = jnp.floor(q[0]), jnp.sign(q[0] - 3), jnp.eye(9)[q[0].astype(int), 1]
+        by_loop = jax.lax.fori_loop(0, 3, lambda k, x: jnp.minimum(x, k * q[0]), 0.0)
+        moving = *sometimes, *by_steps, by_loop
+        return jnp.stack([*moving, args["a"] * 0.0 + 1, jnp.zeros(()), jnp.ones(())])
 
     constants = constant_entries(fn, (jnp.zeros(1), {"a": 2.0 * jnp.ones(())}))
     assert constants is not None
-    np.testing.assert_array_equal(np.isnan(constants), [True, False, False, False])
-    np.testing.assert_array_equal(constants[1:], [1, 0, 1])
+    np.testing.assert_array_equal(np.isnan(constants), 6 * [True] + 3 * [False])
+    np.testing.assert_array_equal(constants[6:], [1, 0, 1])
 
 
 @pytest.mark.parametrize("jit", [False, True])

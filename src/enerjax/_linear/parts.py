@@ -75,7 +75,7 @@ def constant_entries(
     flat, unravel = ravel_pytree(jax.tree.map(jnp.ones_like, numbers))
     values = lambda x: fn(eqx.combine(unravel(x), rest))
     program = jax.make_jaxpr(values)(flat)
-    pattern = jacobian_pattern(lambda x: values(x).ravel(), flat)
+    pattern = jacobian_pattern(lambda x: values(x).ravel(), flat, of_values=True)
     if pattern is None or not is_known(program.consts):
         return None
     with jax.ensure_compile_time_eval():

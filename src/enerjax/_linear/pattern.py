@@ -6,6 +6,7 @@ reductions and moves of entries with known indices; what is not known here (loop
 factorisations, indices that are computed) counts as depending on all that goes into it.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -24,11 +25,14 @@ from .dependence import Constant, Dense, Depends, everything, RULES, Value
 LARGE = 64
 
 
-def jacobian_pattern(fn: Callable[[Array], Array], like: Array) -> csr_array | None:
+def jacobian_pattern(
+    fn: Callable[[Array], Array], like: Array, *, of_values: bool = False
+) -> csr_array | None:
     """The entries of `d fn / dx` that can differ from zero; rows are those of `fn`.
 
     Shape `(fn(like).size, like.size)`; `None` where so many can that the pattern is of no
-    use. Of a traced program: nothing is evaluated but indices.
+    use. Of a traced program: nothing is evaluated but indices. With `of_values` what a
+    value depends on without a derivative, as by a comparison, counts too.
     """
     program = jax.make_jaxpr(fn)(like)
     size = like.size
@@ -36,7 +40,8 @@ def jacobian_pattern(fn: Callable[[Array], Array], like: Array) -> csr_array | N
     consts = [c if is_known(c) else Constant(jnp.asarray(c)) for c in program.consts]
     try:
         with jax.ensure_compile_time_eval():
-            (out,) = interpret(program.jaxpr, consts, [unknowns], _equation)
+            rule = functools.partial(_equation, of_values=of_values)
+            (out,) = interpret(program.jaxpr, consts, [unknowns], rule)
     except Dense:
         return None
     if isinstance(out, Depends):
@@ -49,21 +54,22 @@ def _identity(size: int) -> csr_array:
     return csr_array((np.ones(size, bool), index[:-1], index), shape=(size, size))
 
 
-def _equation(equation: Any, values: list[Value]) -> list[Value]:
+def _equation(equation: Any, values: list[Value], of_values: bool) -> list[Value]:
     primitive, params = equation.primitive, equation.params
     avals = [var.aval for var in equation.outvars]
     named = RULES.get(f"jit {params.get('name')}")
     inner = next((params[k] for k in ("jaxpr", "call_jaxpr") if k in params), None)
     if named is None and inner is not None and primitive.name in _CALLS:
         consts = inner.consts if isinstance(inner, ClosedJaxpr) else []
-        return interpret(getattr(inner, "jaxpr", inner), consts, values, _equation)
+        rule = functools.partial(_equation, of_values=of_values)
+        return interpret(getattr(inner, "jaxpr", inner), consts, values, rule)
     if not any(isinstance(v, Depends) for v in values):
         if any(isinstance(v, Constant) for v in values) or primitive.name in _LOOPS:
             return list(map(Constant, avals))
         return evaluate(primitive, values, params)
-    if not any(jnp.issubdtype(aval.dtype, jnp.inexact) for aval in avals):
-        return list(map(Constant, avals))  # truth values and indices have no derivative
-    if primitive.name in _ZERO:
+    # Truth values and indices have no derivative.
+    smooth = any(jnp.issubdtype(aval.dtype, jnp.inexact) for aval in avals)
+    if not of_values and (not smooth or primitive.name in _ZERO):
         return list(map(Constant, avals))
     rule = named or RULES.get(primitive.name, everything)
     rows = rule(primitive, values, params, avals)
