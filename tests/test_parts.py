@@ -45,6 +45,7 @@ def test_solutions_are_those_of_the_whole_matrix():
 
 
 def test_products_are_those_of_the_whole_matrix():
+    assert PARTS is not None
     product = multiply_parts(PARTS, jnp.asarray(MATRIX), jnp.asarray(RIGHT))
     # Round-off of three terms of order one.
     np.testing.assert_allclose(product, MATRIX @ RIGHT, rtol=0, atol=4e-15)

@@ -38,16 +38,18 @@ def _inverse_jvp(primals, tangents):
     y = inverse(x)
     if x.shape[0] > SMALL:
         return y, -y @ dx @ y
-    return y, -product(product(y, dx), y)
+    return y, -_product(_product(y, dx), y)
 
 
 @jax.jit
 def enerjax_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """By Gauss-Jordan elimination in place with row pivoting; rows are not exchanged.
 
-    The discrete derivative knows it by its name.
+    The discrete derivative and the patterns know it by its name, also under `vmap`.
     """
     size = matrix.shape[0]
+    if size == 1:
+        return 1 / matrix
     if size > SMALL:
         return jnp.linalg.inv(matrix)
     order = jnp.arange(size)
@@ -112,7 +114,7 @@ class Inverse(AbstractFactors):
     def renewed(self, matrix: Float[Array, "n n"]) -> "Inverse":
         sizes = jnp.max(jnp.abs(matrix), axis=1)
         matrix = matrix / sizes[:, None]
-        defect = jnp.eye(matrix.shape[0], dtype=matrix.dtype) - product(
+        defect = jnp.eye(matrix.shape[0], dtype=matrix.dtype) - _product(
             matrix, self.inverse
         )
 
@@ -122,11 +124,11 @@ class Inverse(AbstractFactors):
 
         def turn(carry):
             x, e, size = carry
-            square = product(e, e)
+            square = _product(e, e)
             # What this leaves need not be formed where it is known to be enough.
             left = size * _row_sum(square)
-            x = x + product(x, e + square)
-            e = jax.lax.cond(left > _ENOUGH, lambda: product(e, square), lambda: square)
+            x = x + _product(x, e + square)
+            e = jax.lax.cond(left > _ENOUGH, lambda: _product(e, square), lambda: square)
             return x, e, left
 
         def is_lost(carry) -> Flag:
@@ -180,7 +182,7 @@ _FAR = 0.5
 _ENOUGH = 1e-7
 
 
-def product(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n m"]:
+def _product(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n m"]:
     """A matrix product that XLA fuses with its surroundings, unlike `a @ b`."""
     if a.shape[1] <= _SUMMED:
         return jnp.sum(a[:, :, None] * b[None], axis=1)

@@ -141,10 +141,10 @@ def _added(primitive: Any, values: list[Value], params: Any, avals: Any) -> list
 
 
 def _within(primitive: Any, values: list[Value], params: Any, avals: Any) -> list:
-    """What goes on within each part along the first axis stays there."""
+    """What goes on within each of many matrices stays there."""
     (value,) = values
-    part = np.arange(_entries(value)) // int(np.prod(value.shape[1:], dtype=int))
-    return [_gathered(value.rows, part, value.shape[0])[part]]
+    part = np.arange(_entries(value)) // int(np.prod(value.shape[-2:], dtype=int))
+    return [_gathered(value.rows, part, part[-1] + 1)[part]]
 
 
 def _product(primitive: Any, values: list[Value], params: Any, avals: Any) -> list:
@@ -222,5 +222,5 @@ RULES: dict[str, Callable] = {
     "reduce_prod": _summed,
     "scatter-add": _added,
     "dot_general": _product,
-    "jit enerjax_inverses": _within,
+    "jit enerjax_inverse": _within,
 }

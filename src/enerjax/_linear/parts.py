@@ -9,13 +9,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import jaxpr_as_fun
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from .._tracing import is_known
-from .dense import inverse, product
+from .dense import inverse
 from .indices import Indices
 from .pattern import jacobian_pattern
 
@@ -73,10 +74,12 @@ def constant_entries(
     if not is_known(rest):
         return None
     flat, unravel = ravel_pytree(jax.tree.map(jnp.ones_like, numbers))
-    values = lambda x: fn(eqx.combine(unravel(x), rest))
-    program = jax.make_jaxpr(values)(flat)
-    pattern = jacobian_pattern(lambda x: values(x).ravel(), flat, of_values=True)
-    if pattern is None or not is_known(program.consts):
+    program = jax.make_jaxpr(lambda x: fn(eqx.combine(unravel(x), rest)))(flat)
+    if not is_known(program.consts):
+        return None
+    values = lambda x: jaxpr_as_fun(program)(x)[0]
+    pattern = jacobian_pattern(values, flat, of_values=True)
+    if pattern is None:
         return None
     with jax.ensure_compile_time_eval():
         # What depends on nothing has its value at any point.
@@ -91,24 +94,22 @@ def solve_parts(
     """`matrix^-1 right`, differentiable; not finite where the matrix is singular."""
     if parts is None:
         return inverse(matrix) @ right
-    solutions = []
+    pieces = []
     for size, rows, columns in parts.groups:
         part = _take(right, rows)
-        solutions.append(_solve(_blocks(matrix, rows, columns), part) if size else part)
-    return _joined(solutions, parts.of_columns)
+        pieces.append(_solve(_blocks(matrix, rows, columns), part) if size else part)
+    return _joined(pieces, parts.of_columns)
 
 
 def multiply_parts(
-    parts: Parts | None, matrix: Float[Array, "n n"], x: Float[Array, " n"]
+    parts: Parts, matrix: Float[Array, "n n"], x: Float[Array, " n"]
 ) -> Float[Array, " n"]:
     """`matrix @ x`: each row of what its block depends on, and on nothing else."""
-    if parts is None:
-        return matrix @ x
-    images = []
+    pieces = []
     for size, rows, columns in parts.groups:
         part = _take(x, columns)
-        images.append(_times(_blocks(matrix, rows, columns), part) if size else part)
-    return _joined(images, parts.of_rows)
+        pieces.append(_times(_blocks(matrix, rows, columns), part) if size else part)
+    return _joined(pieces, parts.of_rows)
 
 
 # Blocks that are cut out one by one.
@@ -152,22 +153,4 @@ def _times(blocks: Array, x: Array) -> Array:
     return jnp.sum(blocks * x[:, None, :], axis=-1)
 
 
-_products = jax.vmap(product)
-
-
-@jax.custom_jvp
-def _inverses(blocks: Float[Array, "blocks k k"]) -> Float[Array, "blocks k k"]:
-    return enerjax_inverses(blocks)
-
-
-@_inverses.defjvp
-def _inverses_jvp(primals, tangents):
-    (x,), (dx,) = primals, tangents
-    y = _inverses(x)
-    return y, -_products(_products(y, dx), y)
-
-
-@jax.jit
-def enerjax_inverses(blocks: Float[Array, "blocks k k"]) -> Float[Array, "blocks k k"]:
-    """Of each block. The discrete derivative and the patterns know it by its name."""
-    return 1 / blocks if blocks.shape[-1] == 1 else jax.vmap(inverse)(blocks)
+_inverses = jax.vmap(inverse)
