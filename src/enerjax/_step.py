@@ -16,6 +16,7 @@ from ._energies import Energies
 from ._linear import largest
 from ._model import AbstractModel, make_model
 from ._newton import Newton
+from ._one_function import in_one_function
 from ._results import first_of, RESULTS
 from ._root import RootFinder
 from ._schemes import AbstractScheme
@@ -157,7 +158,8 @@ def _single_step(system, scheme, state, args, h, warm, root_finder, max_halvings
             "or none."
         )
     no = jnp.array(False)
-    out = advance(scheme, model, state, h, warm, root_finder, no, max_halvings)
+    go = lambda: advance(scheme, model, state, h, warm, root_finder, no, max_halvings)
+    out = in_one_function(go)()
     return eqx.tree_at(lambda out: out.state, out, model.leave(out.state))
 
 

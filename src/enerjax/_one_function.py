@@ -1,0 +1,163 @@
+"""Steps of small systems as one function of machine code each, on CPUs.
+
+XLA's CPU back end calls one function for each of the hundred or so array operations of a
+step, and the calls take longer than the operations. It has a remedy for small loops (see
+`_fast_loops.py`), which compiles all of a computation into one function, and it takes any
+call that is marked as one of these. Not every operation is possible inside: only those
+which need nothing from the runtime.
+"""
+
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlib
+from jax.experimental.xla_metadata import set_xla_metadata
+from jax.extend.core import ClosedJaxpr, Jaxpr
+from jaxtyping import Array, PyTree
+
+from ._types import Scalar
+
+
+# The marks are those of these versions. Others would not know them, or not keep to them.
+_KNOWS_MARKS = (0, 10, 2) <= jaxlib.version.__version_info__ < (0, 11)
+_MARKS = {"xla_cpu_small_call": "true", "inlineable": "false"}
+
+# Entries of what is summed, above which XLA calls a library; here with room to spare.
+_FEW = 2048
+# Rows or columns from which it does for products of matrices.
+_THIN = 8
+
+_CALLS = """
+    jit pjit closed_call core_call checkpoint remat remat2 custom_jvp_call custom_vjp_call
+    custom_vjp_call_jaxpr custom_vmap_call while cond scan
+"""
+_MOVES = """
+    broadcast_in_dim concatenate copy copy_p dynamic_slice dynamic_update_slice expand_dims
+    gather iota pad platform_index reshape rev select_n slice split squeeze stack
+    stop_gradient transpose unstack
+"""
+_ELEMENTWISE = """
+    abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp
+    convert_element_type cos cosh digamma div eq erf erf_inv erfc exp exp2 expm1 floor ge gt
+    integer_pow is_finite le lgamma log log1p logistic lt max min mul name ne neg nextafter
+    not or population_count pow rem round rsqrt shift_left shift_right_arithmetic
+    shift_right_logical sign sin sinh sqrt square sub tan tanh xor
+"""
+_SUMS = "argmax argmin reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum"
+_POSSIBLE = frozenset((_CALLS + _MOVES + _ELEMENTWISE).split())
+_POSSIBLE_IF_SMALL = frozenset(_SUMS.split())
+
+
+def in_one_function(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Array]]:
+    """`fn`, between trees of arrays, as one function of machine code where it can be.
+
+    The same values either way. Derivatives, and batches of so many lanes that their
+    operations are no longer small, are compiled as usual. Every array in its arguments must
+    reach one that it returns; what it closes over need not.
+    """
+    if not _KNOWS_MARKS or jax.default_backend() != "cpu":
+        return fn
+
+    def call(*args: PyTree[Array]) -> PyTree[Array]:
+        return _call(eqx.filter_closure_convert(fn, *args), args)
+
+    return call
+
+
+@eqx.filter_custom_jvp
+def _call(program: Callable[..., PyTree[Array]], args: tuple) -> PyTree[Array]:
+    (closure, args), static = eqx.partition((program, args), _is_full)
+
+    def plain(closure: PyTree[Array], args: PyTree[Array]) -> PyTree[Array]:
+        program, own = eqx.combine((closure, args), static)
+        return program(*own)
+
+    one = jax.custom_batching.custom_vmap(functools.partial(_marked, plain))
+
+    @one.def_vmap
+    def many(axis_size, in_batched, *numbers):  # pyright: ignore[reportUnusedFunction]
+        del axis_size
+        axes = jax.tree.map(lambda batched: 0 if batched else None, tuple(in_batched))
+        out = _marked(jax.vmap(plain, in_axes=axes), *numbers)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return one(closure, args)
+
+
+@_call.def_jvp
+def _call_jvp(primals, tangents):
+    run = lambda program, args: program(*args)
+    return eqx.filter_jvp(run, primals, tangents)
+
+
+def _is_full(x: Any) -> bool:
+    return eqx.is_array(x) and x.size > 0
+
+
+def _marked(
+    fn: Callable[[PyTree[Array], PyTree[Array]], PyTree[Array]],
+    closure: PyTree[Array],
+    args: PyTree[Array],
+) -> PyTree[Array]:
+    if not _is_possible(jax.make_jaxpr(fn)(closure, args).jaxpr):
+        return fn(closure, args)
+
+    def with_witness(closure, args):
+        # XLA ends the process where an input of such a function is not used.
+        firsts = [_first(x).astype(float) for x in jax.tree.leaves(closure)]
+        return fn(closure, args), functools.reduce(jnp.add, firsts, jnp.zeros(()))
+
+    out, sign = jax.jit(with_witness)(closure, args)
+    # The marks go to what made the value: the call.
+    witness: Any = set_xla_metadata(sign, **_MARKS)
+    leaves, structure = jax.tree.flatten(out)
+    # Nothing here may find that the witness is not needed.
+    leaves[0] = jnp.where(witness > 0, leaves[0], leaves[0])
+    return jax.tree.unflatten(structure, leaves)
+
+
+def _first(x: Array) -> Scalar:
+    return jax.lax.slice(x, (0,) * x.ndim, (1,) * x.ndim).reshape(())
+
+
+def _is_possible(jaxpr: Jaxpr) -> bool:
+    for eqn in jaxpr.eqns:
+        name = eqn.primitive.name
+        if name in _POSSIBLE_IF_SMALL:
+            possible = all(x.aval.size <= _FEW for x in eqn.invars)  # pyright: ignore
+        elif name == "dot_general":
+            possible = _is_small_product(eqn)
+        else:
+            possible = name in _POSSIBLE
+        if not possible or not all(map(_is_possible, _inner(eqn.params.values()))):
+            return False
+    return True
+
+
+def _is_small_product(eqn: Any) -> bool:
+    """Whether XLA writes out a product, instead of calling a library."""
+    sizes = [x.aval.shape for x in eqn.invars]
+    contracted, batch = eqn.params["dimension_numbers"]
+    left, right = (
+        [n for k, n in enumerate(shape) if k not in (*used, *of_batch)]
+        for shape, used, of_batch in zip(sizes, contracted, batch, strict=True)
+    )
+    if max(x.aval.size for x in eqn.invars) > _FEW:
+        return False
+    is_thin = max((*sizes[0], *sizes[1]), default=1) < _THIN
+    return is_thin or not left or not right
+
+
+def _inner(params: Any) -> Iterator[Jaxpr]:
+    """The programs among the parameters of an equation."""
+    for param in params:
+        if isinstance(param, ClosedJaxpr):
+            yield param.jaxpr
+        elif isinstance(param, Jaxpr):
+            yield param
+        elif isinstance(param, tuple | list):
+            yield from _inner(param)

@@ -1,0 +1,209 @@
+"""Whole steps as one function of machine code: where, and that it changes no value."""
+
+import jax
+import jax.numpy as jnp
+import jax.scipy.special as special
+import numpy as np
+import pytest
+
+import enerjax as ej
+from enerjax import _one_function
+from enerjax._one_function import in_one_function
+
+
+pytestmark = pytest.mark.skipif(
+    not _one_function._KNOWS_MARKS or jax.default_backend() != "cpu",
+    reason="for versions of XLA that know the marks",
+)
+X = jnp.linspace(0.15, 0.85, 6).reshape(2, 3)
+K = jnp.arange(1, 7).reshape(2, 3)
+
+
+def is_marked(fn, *args):
+    """Whether a program calls a function of ours. (XLA itself makes some of loops.)"""
+    text = jax.jit(fn).lower(*args).compile().as_text()
+    calls = [line for line in text.splitlines() if "to_apply=%with_witness" in line]
+    return any('xla_cpu_small_call="true"' in line for line in calls)
+
+
+def names(jaxpr):
+    for eqn in jaxpr.eqns:
+        yield eqn.primitive.name
+        for inner in _one_function._inner(eqn.params.values()):
+            yield from names(inner)
+
+
+def elementwise(x, k):
+    lax = jax.lax
+    bits = k.astype(jnp.uint64)
+    return [
+        *(f(x) for f in (jnp.abs, jnp.acos, jnp.asin, jnp.atan, jnp.asinh, jnp.atanh)),
+        *(f(x) for f in (jnp.ceil, jnp.floor, jnp.round, jnp.sign, jnp.cos, jnp.sin)),
+        *(f(x) for f in (jnp.tan, jnp.cosh, jnp.sinh, jnp.tanh, jnp.exp, jnp.exp2)),
+        *(f(x) for f in (jnp.expm1, jnp.log, jnp.log1p, jnp.sqrt, jnp.cbrt, lax.rsqrt)),
+        *(f(x) for f in (jnp.isfinite, jax.nn.sigmoid, lax.erf, lax.erfc, lax.erf_inv)),
+        *(f(x) for f in (special.gammaln, special.digamma, jnp.square, lax.neg)),
+        jnp.acosh(1 + x),
+        *(f(x, 1 - x) for f in (jnp.atan2, jnp.maximum, jnp.minimum, lax.rem, lax.div)),
+        *(f(x, 1 - x) for f in (jnp.nextafter, lax.eq, lax.ne, lax.lt, lax.le, lax.gt)),
+        *(f(x, 1 - x) for f in (lax.ge, lax.pow, lax.sub, lax.mul, lax.add)),
+        x**3,
+        lax.clamp(0.2, x, 0.6),
+        *(f(k, k + 1) for f in (lax.bitwise_and, lax.bitwise_or, lax.bitwise_xor)),
+        lax.bitwise_not(k),
+        lax.population_count(bits),
+        *(f(bits, bits) for f in (lax.shift_left, lax.shift_right_logical)),
+        lax.shift_right_arithmetic(k, k),
+        k.astype(float),
+    ]
+
+
+def moves(x, k):
+    lax = jax.lax
+    i = k[0, 0] - 1
+    return [
+        jnp.concatenate([x, x]),
+        *(jnp.stack([x, 2 * x]), *jnp.unstack(x)),
+        lax.dynamic_slice(x, (i, i), (1, 2)),
+        lax.dynamic_update_slice(x, x[:1, :1], (i, i)),
+        *(jnp.expand_dims(x, 1), jnp.squeeze(x[:1]), x.T, x.reshape(-1), x[:, ::-1]),
+        *(x[:, jnp.array([2, 0])], x[i], lax.rev(x, (0,)), jnp.pad(x, 1)),
+        *jnp.split(x, [1], axis=1),
+        jnp.arange(6.0).reshape(2, 3) + x,
+        *(jnp.where(x > 0.5, x, -x), jnp.copy(x), lax.stop_gradient(x), jnp.diag(x[0])),
+        jnp.take(x, jnp.array([1, 0]), axis=0),
+    ]
+
+
+def sums(x, k):
+    return [
+        *(f(x, axis=1) for f in (jnp.sum, jnp.max, jnp.min, jnp.prod)),
+        *(f(x, axis=1) for f in (jnp.argmax, jnp.argmin)),
+        *(jnp.any(x > 0.5), jnp.all(k > 1), x @ x.T, x @ x[0], jnp.vdot(x, x)),
+        jnp.einsum("ij,kj->ik", x, x),
+    ]
+
+
+@jax.custom_jvp
+def _with_own_jvp(x):
+    return jnp.sin(x)
+
+
+_with_own_jvp.defjvp(lambda x, t: (_with_own_jvp(*x), t[0]))
+
+
+@jax.custom_vjp
+def _with_own_vjp(x):
+    return jnp.cos(x)
+
+
+_with_own_vjp.defvjp(lambda x: (jnp.cos(x), x), lambda x, t: (t,))
+
+
+@jax.custom_batching.custom_vmap
+def _with_own_vmap(x):
+    return 2 * x
+
+
+@_with_own_vmap.def_vmap
+def _(size, is_batched, x):
+    return 2 * x, True
+
+
+def calls(x, k):
+    lax = jax.lax
+    return [
+        *(_with_own_jvp(x), _with_own_vjp(x), _with_own_vmap(x), jax.jit(jnp.sin)(x)),
+        jax.checkpoint(jnp.sin)(x),
+        lax.while_loop(lambda c: c[0] < k[0, 1], lambda c: (c[0] + 1, 2 * c[1]), (0, x))[1],
+        lax.cond(k[0, 0] > 0, jnp.sin, jnp.cos, x),
+        lax.scan(lambda c, y: (c + y, c * y), x[0], x),
+        lax.fori_loop(0, 5, lambda n, c: c + n * x, x),
+    ]
+
+
+GROUPS = [elementwise, moves, sums, calls]
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_operations_that_are_possible(group):
+    out = in_one_function(group)
+    assert is_marked(out, X, K)
+    plain, whole = jax.jit(group)(X, K), jax.jit(out)(X, K)
+    for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(whole), strict=True):
+        # Round-off, of sums whose terms are of order one.
+        np.testing.assert_allclose(a, b, rtol=4e-15, atol=4e-15)
+
+
+def test_each_operation_that_is_called_possible_is_tried():
+    tried = {name for f in GROUPS for name in names(jax.make_jaxpr(f)(X, K).jaxpr)}
+    possible = _one_function._POSSIBLE | _one_function._POSSIBLE_IF_SMALL
+    # Other names of the same, of other versions or made by derivatives alone.
+    others = "add_any closed_call copy_p core_call custom_vjp_call_jaxpr remat remat2 pjit"
+    others += " stop_gradient name checkpoint expand_dims platform_index copy"
+    assert possible - tried <= set(others.split())
+
+
+LARGE = jnp.linspace(0.0, 1.0, 5000)
+NOT_POSSIBLE = {
+    "sort": lambda x: jnp.sort(x[0]),
+    "scatter": lambda x: x.at[jnp.array([1, 0]), jnp.array([2, 2])].add(1.0),
+    "cholesky": lambda x: jnp.linalg.cholesky(x @ x.T + jnp.eye(2)),
+    "long sum": lambda x: jnp.sum(LARGE * x[0, 0]),
+    "matrices": lambda x: jnp.tile(x, (5, 4)) @ jnp.tile(x, (6, 4)),
+    "in a loop": lambda x: jax.lax.fori_loop(0, 3, lambda _, y: jnp.sort(y), x),
+}
+
+
+@pytest.mark.parametrize("name", NOT_POSSIBLE)
+def test_what_is_not_possible_is_left_as_it_is(name):
+    fn = NOT_POSSIBLE[name]
+    left = in_one_function(fn)
+    assert not is_marked(left, X)
+    np.testing.assert_array_equal(jax.jit(left)(X), jax.jit(fn)(X))
+
+
+def test_inputs_that_are_not_used():
+    """They would end the process."""
+
+    def run(x, unused, empty):
+        out = in_one_function(lambda x: (jnp.sin(x), 0 * empty, 0 * unused[:1] * K + K))
+        loop = jax.lax.scan(lambda c, _: (out(c)[0], out(c)), x, None, length=400)
+        return loop[1][2].sum()
+
+    assert is_marked(run, X, K, jnp.zeros((0, 3)))
+    assert jax.jit(run)(X, K, jnp.zeros((0, 3))) == 400 * K.sum()
+
+
+def smooth(x):
+    return jnp.sum(jnp.sin(x) * jnp.tanh(x[::-1])) * x
+
+
+def test_derivatives_and_lanes():
+    whole, xs = in_one_function(smooth), jnp.stack([X, 2 * X, 3 * X])
+    total = lambda f: lambda x: jnp.sum(f(x) ** 2)
+    for of in (
+        lambda f: f(X),
+        lambda f: jax.jvp(f, (X,), (X,)),
+        lambda f: jax.grad(total(f))(X),
+        lambda f: jax.jvp(jax.grad(total(f)), (X,), (X,)),
+        lambda f: jax.vmap(f)(xs),
+        lambda f: jax.vmap(jax.grad(total(f)))(xs),
+        lambda f: jax.vmap(jax.vmap(f))(xs[None]),
+    ):
+        close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=0)
+        jax.tree.map(close, jax.jit(lambda of=of: of(whole))(), of(smooth))
+
+
+def test_many_lanes_are_compiled_as_usual():
+    whole = in_one_function(smooth)
+    assert is_marked(jax.vmap(whole), jnp.ones((3, 2, 3)))
+    assert not is_marked(jax.vmap(whole), jnp.ones((2000, 2, 3)))
+
+
+def test_steps_of_small_systems_are_one_function():
+    system, start, args = ej.problems.pendulum()
+    run = lambda args: ej.simulate(
+        system, ej.EnergyPreserving(), start, args, h=0.01, num_steps=200, throw=False
+    )
+    assert is_marked(run, args)
