@@ -4,6 +4,7 @@ import subprocess
 import sys
 
 import jax
+import jax.numpy as jnp
 import pytest
 
 import enerjax as ej
@@ -38,6 +39,18 @@ def test_a_state_is_made_of_numbers(bad, is_type_checked):
 def test_bad_shapes_are_told_under_jit_too():
     with pytest.raises(ValueError, match="must return a vector"):
         jax.jit(lambda h: simulate(constraint=lambda q, args: q @ q - 1, h=h))(0.01)
+
+
+def test_lanes_that_devices_would_mix_are_refused():
+    by_device = jax.sharding.PartitionSpec("lanes")
+    mesh = jax.make_mesh((1,), ("lanes",), axis_types=(jax.sharding.AxisType.Auto,))
+    run = lambda m: simulate(args=ARGS | dict(m=m[0])).ys.q[None]
+    many = lambda check: jax.shard_map(
+        run, mesh=mesh, in_specs=by_device, out_specs=by_device, check_vma=check
+    )
+    with pytest.raises(ValueError, match="check_vma"):
+        many(True)(jnp.ones(1))
+    assert many(False)(jnp.ones(1)).shape[0] == 1
 
 
 def test_the_step_checks_its_input_too():

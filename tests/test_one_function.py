@@ -21,7 +21,7 @@ K = jnp.arange(1, 7).reshape(2, 3)
 
 def is_marked(fn, *args):
     """Whether a program calls a function of ours. (XLA itself makes some of loops.)"""
-    text = jax.jit(fn).lower(*args).compile().as_text()
+    text = jax.jit(fn).lower(*args).compile().as_text() or ""
     calls = [line for line in text.splitlines() if "to_apply=%with_witness" in line]
     return any('xla_cpu_small_call="true"' in line for line in calls)
 

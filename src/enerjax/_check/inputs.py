@@ -43,6 +43,7 @@ def prepare(
             f"`scheme` must be a scheme such as `EnergyPreserving()`, got {scheme!r}"
             + (": the parentheses are missing." if isinstance(scheme, type) else ".")
         )
+    _check_not_mixed((scheme, h))
     start, args = check_system(system, start, args, t)
     if system.force is not None and min(scheme.stages) < 0:
         raise ValueError(
@@ -96,6 +97,7 @@ def check_system(
     """Checks a system against a state, `args` and the time, and makes arrays of them."""
     if not isinstance(system, AbstractSystem):
         raise TypeError(f"`system` must be an `enerjax.System`, got {type(system)}.")
+    _check_not_mixed((system, state, args, t))
     if not isinstance(state, State):
         raise TypeError(
             f"The start must be an `enerjax.State(q, v)`, got {type(state)}. "
@@ -125,6 +127,21 @@ def check_system(
     if is_known((system, state, args)):
         check_values(system, state, args)
     return state, args
+
+
+def _check_not_mixed(tree: Any) -> None:
+    """A derivative by what is the same on all devices would be summed over them."""
+    kinds = [jax.typeof(x) for x in jax.tree.leaves(tree) if isinstance(x, jax.Array)]
+    # Since JAX 0.10 a part of what it has been before.
+    parts = [getattr(kind, "manual_axis_type", None) for kind in kinds]
+    if any(getattr(kind, "vma", None) for kind in kinds) or any(
+        getattr(part, "varying", None) for part in parts
+    ):
+        raise ValueError(
+            "Inside `jax.shard_map` numbers differ from device to device, and JAX would sum "
+            "the derivatives that make the step equations over the devices. Pass "
+            "`check_vma=False` to `shard_map`, or shard the inputs of `jit(vmap(...))`."
+        )
 
 
 @functools.cache

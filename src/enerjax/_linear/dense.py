@@ -97,9 +97,9 @@ class AbstractFactors(eqx.Module):
 class Inverse(AbstractFactors):
     """An approximate inverse, which a chord iteration makes good.
 
-    Renewed by the iteration of G. Schulz (1933), `X (1 + E)` or `X (1 + E + E^2)` with
-    `E = 1 - A X`, which leave `E^2` and `E^3`; computed afresh where the old one is too far
-    off. Of the matrix with rows of size one: others would make `E` look larger than it is.
+    Renewed by the iteration of G. Schulz (1933), `X (1 + E + E^2)` with `E = 1 - A X`, which
+    leaves `E^3`; computed afresh where the old one is too far off. Of the matrix with rows
+    of size one: others would make `E` look larger than it is.
     """
 
     inverse: Float[Array, "n n"]
@@ -114,32 +114,32 @@ class Inverse(AbstractFactors):
     def renewed(self, matrix: Float[Array, "n n"]) -> "Inverse":
         sizes = jnp.max(jnp.abs(matrix), axis=1)
         matrix = matrix / sizes[:, None]
-        defect = jnp.eye(matrix.shape[0], dtype=matrix.dtype) - _product(
-            matrix, self.inverse
-        )
+        identity = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
+
+        def improved(x, e, size):
+            """The next inverse, its error `e^3` in factors, and a bound on its size."""
+            square = _product(e, e)
+            x = x + _product(x, e + square)
+            return x, (e, square), size * _row_sum(square)
 
         def is_rough(carry) -> Flag:
             _, _, size = carry
             return (size > _ENOUGH) & (size < _FAR)
 
         def turn(carry):
-            x, e, size = carry
-            square = _product(e, e)
-            # What this leaves need not be formed where it is known to be enough.
-            left = size * _row_sum(square)
-            x = x + _product(x, e + square)
-            e = jax.lax.cond(left > _ENOUGH, lambda: _product(e, square), lambda: square)
-            return x, e, left
+            x, error, size = carry
+            return improved(x, _product(*error), size)
 
         def is_lost(carry) -> Flag:
             _, _, size = carry
             return ~(size < _FAR)
 
         def start_again(carry):
-            _, e, _ = carry
-            return inverse(matrix), e, jnp.zeros((), matrix.dtype)
+            _, error, size = carry
+            return inverse(matrix), error, jnp.zeros_like(size)
 
-        carry = self.inverse, defect, _row_sum(defect)
+        defect = identity - _product(matrix, self.inverse)
+        carry = improved(self.inverse, defect, _row_sum(defect))
         carry = jax.lax.while_loop(is_rough, turn, carry)
         return Inverse(jax.lax.while_loop(is_lost, start_again, carry)[0], sizes)
 
