@@ -18,8 +18,8 @@ TESTS = sorted(pathlib.Path(__file__).parent.glob("*.py"))
 
 # Each imports only from lower layers: from what stands further up.
 LAYERS = [
-    {"_types", "_tracing", "_fast_loops", "_one_function", "_energies"},
-    {"_results", "_lanes"},
+    {"_types", "_tracing", "_fast_loops", "_energies"},
+    {"_results", "_lanes", "_one_function"},
     {"_discrete"},
     {"_linear"},
     {"_kinematics", "_newton"},

@@ -70,7 +70,7 @@ def in_one_function(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Ar
 
 @eqx.filter_custom_jvp
 def _call(program: Callable[..., PyTree[Array]], args: tuple) -> PyTree[Array]:
-    (closure, args), static = eqx.partition((program, args), _is_full)
+    (closure, args), static = eqx.partition((program, args), eqx.is_array)
 
     def plain(closure: PyTree[Array], args: PyTree[Array]) -> PyTree[Array]:
         program, own = eqx.combine((closure, args), static)
@@ -94,10 +94,6 @@ def _call_jvp(primals, tangents):
     return eqx.filter_jvp(run, primals, tangents)
 
 
-def _is_full(x: Any) -> bool:
-    return eqx.is_array(x) and x.size > 0
-
-
 def _marked(
     fn: Callable[[PyTree[Array], PyTree[Array]], PyTree[Array]],
     closure: PyTree[Array],
@@ -105,13 +101,17 @@ def _marked(
 ) -> PyTree[Array]:
     if not _is_possible(jax.make_jaxpr(fn)(closure, args).jaxpr):
         return fn(closure, args)
+    # XLA ends the process where an input of such a function is not used: what is empty is
+    # made inside, and of what `fn` may not need a number goes into a witness.
+    inputs, empty = eqx.partition((closure, args), lambda x: x.size > 0)
 
-    def with_witness(closure, args):
-        # XLA ends the process where an input of such a function is not used.
-        firsts = [_first(x).astype(float) for x in jax.tree.leaves(closure)]
-        return fn(closure, args), functools.reduce(jnp.add, firsts, jnp.zeros(()))
+    def with_witness(inputs):
+        made = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), empty)
+        firsts = [_first(x).astype(float) for x in jax.tree.leaves(inputs[0])]
+        out = fn(*eqx.combine(inputs, made))
+        return out, functools.reduce(jnp.add, firsts, jnp.zeros(()))
 
-    out, sign = jax.jit(with_witness)(closure, args)
+    out, sign = jax.jit(with_witness)(inputs)
     # The marks go to what made the value: the call.
     witness: Any = set_xla_metadata(sign, **_MARKS)
     leaves, structure = jax.tree.flatten(out)

@@ -138,8 +138,8 @@ def _check_not_mixed(tree: Any) -> None:
         getattr(part, "varying", None) for part in parts
     ):
         raise ValueError(
-            "Inside `jax.shard_map` numbers differ from device to device, and JAX would sum "
-            "the derivatives that make the step equations over the devices. Pass "
+            "These numbers differ from device to device inside `jax.shard_map`, where JAX "
+            "would sum the derivatives that make the step equations over the devices. Pass "
             "`check_vma=False` to `shard_map`, or shard the inputs of `jit(vmap(...))`."
         )
 

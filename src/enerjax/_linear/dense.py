@@ -97,9 +97,9 @@ class AbstractFactors(eqx.Module):
 class Inverse(AbstractFactors):
     """An approximate inverse, which a chord iteration makes good.
 
-    Renewed by the iteration of G. Schulz (1933), `X (1 + E + E^2)` with `E = 1 - A X`, which
-    leaves `E^3`; computed afresh where the old one is too far off. Of the matrix with rows
-    of size one: others would make `E` look larger than it is.
+    Renewed by the iteration of G. Schulz (1933), `X (1 + E + E^2)` with `E = 1 - A X`,
+    which leaves `E^3`; computed afresh where the old one is too far off. Of the matrix with
+    rows of size one: others would make `E` look larger than it is.
     """
 
     inverse: Float[Array, "n n"]
