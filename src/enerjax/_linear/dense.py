@@ -21,8 +21,6 @@ from .norms import largest
 SMALL = 32
 # Rows up to which the elimination is written out: it compiles slowly.
 _UNROLLED = 3
-# Rows up to which a product of matrices is a sum along an axis.
-_SUMMED = 10
 
 
 @jax.custom_jvp
@@ -136,7 +134,10 @@ class Inverse(AbstractFactors):
 
         def start_again(carry):
             _, error, size = carry
-            return inverse(matrix), error, jnp.zeros_like(size)
+            # By a one that XLA cannot see: it would move what does not change in a loop out
+            # of it, and eliminate in every step.
+            one = jnp.where(size < _FAR, 0, jnp.ones_like(size))
+            return inverse(one * matrix), error, jnp.zeros_like(size)
 
         defect = identity - _product(matrix, self.inverse)
         carry = improved(self.inverse, defect, _row_sum(defect))
@@ -184,8 +185,6 @@ _ENOUGH = 1e-7
 
 def _product(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n m"]:
     """A matrix product that XLA fuses with its surroundings, unlike `a @ b`."""
-    if a.shape[1] <= _SUMMED:
-        return jnp.sum(a[:, :, None] * b[None], axis=1)
     # Row by row of `b`: the inner loop is over neighbours, and is vectorised.
     terms = (a[:, k, None] * b[None, k] for k in range(a.shape[1]))
     return functools.reduce(jnp.add, terms)
