@@ -29,12 +29,16 @@ PENDULUM = [
     ("EnergyDecaying(0.5)", 1e-3, 1e-2),
     ("EnergyConsistent(0.0)", 1e-3, 1e-4),
     ("EnergyConsistent(0.5)", 1e-3, 1e-3),
+    ("EnergyConsistent(0.0)", 2.5e-3, 1e-5),
     ("EnergyConsistent(0.0)", 1e-2, 1e-2),
+    ("EnergyConsistent(0.0)", 2.5e-2, 1e-2),
     ("Composed(EnergyPreserving(), 4)", 4e-3, 1e-3),
+    ("Composed(EnergyPreserving(), 4)", 2e-2, 1e-3),
 ]
 TOP = [
     ("EnergyPreserving()", 1e-3, 3e-2),
     ("Composed(EnergyPreserving(), 4)", 2e-3, 1e-3),
+    ("Composed(EnergyPreserving(), 4)", 3.125e-3, 1e-3),
 ]
 
 

@@ -1,6 +1,6 @@
-"""Steps of small systems as one function of machine code each, on CPUs.
+"""Loops over the steps of small systems as one function of machine code, on CPUs.
 
-XLA's CPU back end calls one function for each of the hundred or so array operations of a
+XLA's CPU back end calls a function for each of the hundred or so array operations of a
 step, and the calls take longer than the operations. It has a remedy for small loops (see
 `_fast_loops.py`), which compiles all of a computation into one function, and it takes any
 call that is marked as one of these. Not every operation is possible inside: only those

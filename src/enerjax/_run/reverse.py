@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from .._lanes import anywhere
+from .._one_function import in_one_function
 from .._root import ROOT
 
 
@@ -63,12 +64,13 @@ def _in_segments(
 ) -> tuple[Any, Any]:
     """A scan over `live`, whose segments are checkpointed.
 
-    Where segments of no suitable length fill the run, turns that are not live are added.
+    Where segments of no suitable length fill the run, turns that are not live are added. A
+    segment of a small system is one function of machine code.
     """
     length = live.size
     size = min(range((about + 1) // 2, 2 * about + 1), key=lambda size: -length % size)
     live = jnp.append(live, jnp.zeros((-length % size,), bool)).reshape(-1, size)
-    segment = keep(lambda carry, live: jax.lax.scan(body, carry, live))
+    segment = keep(in_one_function(lambda carry, live: jax.lax.scan(body, carry, live)))
     if done is not None:
         segment = _unless(done, segment)
     carry, out = jax.lax.scan(segment, carry, live)

@@ -9,7 +9,6 @@ from .._audit import audit
 from .._check import check_form, check_halvings, positive_integer, prepare
 from .._model import make_model
 from .._newton import Newton
-from .._one_function import in_one_function
 from .._results import first_failure, RESULTS
 from .._root import RootFinder
 from .._schemes import AbstractScheme
@@ -164,7 +163,6 @@ def _run(
         """With the time after some steps, counted and not summed up, where time enters."""
         return State(state.q, state.v, t0 + h * steps if system.is_timed else None)
 
-    @in_one_function
     def one_step(carry: _Carry, live: Flag):
         skip = (carry.result != RESULTS.successful) | ~live
         begin = timed(carry.state, carry.completed.astype(h.dtype))

@@ -10,7 +10,6 @@ from jaxtyping import PyTree
 from .._audit import audit
 from .._check import bound_on_steps, check_times, prepare
 from .._model import make_model
-from .._one_function import in_one_function
 from .._results import first_failure, RESULTS
 from .._root import RootFinder
 from .._schemes import AbstractScheme
@@ -114,7 +113,6 @@ def _run(
         """With the time, where time enters."""
         return State(state.q, state.v, t0 + duration * passed if system.is_timed else None)
 
-    @in_one_function
     def attempt(carry: _Carry, live: Flag) -> tuple[_Carry, Step]:
         live = live & ~_done(carry)
         passed, length = pace.next(carry.memory, carry.passed, carry.completed)
