@@ -127,7 +127,7 @@ def show(rows: list[harness.Row]) -> None:
         ratio = f"x {row['us_per_step'] / anchor:6.2f}" if anchor and "steps" in row else ""
         total = row.get("us_per_step", np.nan) * row.get("steps", 0) / 1e3
         print(
-            f"{row['work']:9s} {row['mode']:8s} {row['method']:32s} h {row['h']:.0e} "
+            f"{row['work']:9s} {row['mode']:8s} {row['method']:32s} h {row['h']:<8.3g} "
             f"{row.get('us_per_step', np.nan):8.2f} us/step {ratio:9s} {total:8.2f} ms  "
             f"error {row['error']:.1e}  energy {row['energy']:.0e}  "
             f"compile {row.get('compile_s', 0):5.1f} s"
