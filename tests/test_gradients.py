@@ -228,3 +228,20 @@ def test_numbers_that_the_functions_close_over_count():
     forward, reverse = push(9.81)[1], jax.jit(jax.grad(tip))(9.81)
     np.testing.assert_allclose(forward, reverse, rtol=1e-10)  # solver
     np.testing.assert_allclose(reverse, difference, rtol=1e-6)  # of the difference
+
+
+def test_derivatives_of_a_free_oscillator():
+    """Without constraints: what belongs to them is empty, in derivatives too."""
+    kinetic = lambda v, args: 0.5 * args["m"] * v @ v
+    system = ej.System(kinetic, lambda q, args: 4.5 * q @ q)
+    start, t, w = ej.State(jnp.ones(1), jnp.zeros(1)), 0.2, 3.0
+
+    def end(m):
+        run = ej.simulate(
+            system, ej.EnergyConsistent(0.0), start, {"m": m}, h=t / 20, num_steps=20
+        )
+        return run.ys.q[-1, 0]
+
+    # Truncation, of order (w h)^4.
+    exact = 0.5 * w * t * np.sin(w * t)
+    np.testing.assert_allclose(jax.jit(jax.grad(end))(1.0), exact, rtol=1e-6)

@@ -186,8 +186,8 @@ _ENOUGH = 1e-7
 def _product(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n m"]:
     """A matrix product that XLA fuses with its surroundings, unlike `a @ b`."""
     # Row by row of `b`: the inner loop is over neighbours, and is vectorised.
-    terms = (a[:, k, None] * b[None, k] for k in range(a.shape[1]))
-    return functools.reduce(jnp.add, terms)
+    terms = [a[:, k, None] * b[None, k] for k in range(a.shape[1])]
+    return functools.reduce(jnp.add, terms) if terms else a @ b
 
 
 def _row_sum(matrix: Float[Array, "n n"]) -> Scalar:
