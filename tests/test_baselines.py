@@ -137,7 +137,7 @@ def test_order_with_a_damper_and_a_drive(scheme):
     # The works are those of the equations: what they leave unexplained in one step is a
     # local error.
     np.testing.assert_allclose(
-        slopes([abs(run.dissipated) for run in runs]), 3, rtol=0, atol=0.4
+        slopes([abs(run.energies.dissipated) for run in runs]), 3, rtol=0, atol=0.4
     )
 
 

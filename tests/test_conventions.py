@@ -103,6 +103,7 @@ def test_newton_knows_no_mechanics():
             "enerjax._types",
             "enerjax._linear",
             "enerjax._newton",
+            "enerjax._one_function",
             "enerjax._tracing",
         }
 

@@ -8,7 +8,7 @@ which need nothing from the runtime.
 """
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -16,9 +16,10 @@ import jax
 import jax.numpy as jnp
 import jaxlib
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import ClosedJaxpr, Jaxpr
+from jax.extend.core import Jaxpr, jaxpr_as_fun
 from jaxtyping import Array, PyTree
 
+from ._tracing import programs_within
 from ._types import Scalar
 
 
@@ -32,13 +33,12 @@ _FEW = 2048
 _THIN = 8
 
 _CALLS = """
-    jit pjit closed_call core_call checkpoint remat remat2 custom_jvp_call custom_vjp_call
-    custom_vjp_call_jaxpr custom_vmap_call while cond scan
+    jit remat2 custom_jvp_call custom_vjp_call custom_vmap_call while cond scan
 """
 _MOVES = """
-    broadcast_in_dim concatenate copy copy_p dynamic_slice dynamic_update_slice expand_dims
-    gather iota pad platform_index reshape rev select_n slice split squeeze stack
-    stop_gradient transpose unstack
+    broadcast_in_dim concatenate copy dynamic_slice dynamic_update_slice gather iota pad
+    platform_index reshape rev select_n slice split squeeze stack stop_gradient transpose
+    unstack
 """
 _ELEMENTWISE = """
     abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp
@@ -56,8 +56,7 @@ def in_one_function(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Ar
     """`fn`, between trees of arrays, as one function of machine code where it can be.
 
     The same values either way. Derivatives, and batches of so many lanes that their
-    operations are no longer small, are compiled as usual. Every array in its arguments must
-    reach one that it returns; what it closes over need not.
+    operations are no longer small, are compiled as usual.
     """
     if not _KNOWS_MARKS or jax.default_backend() != "cpu":
         return fn
@@ -99,25 +98,31 @@ def _marked(
     closure: PyTree[Array],
     args: PyTree[Array],
 ) -> PyTree[Array]:
-    if not _is_possible(jax.make_jaxpr(fn)(closure, args).jaxpr):
-        return fn(closure, args)
     # XLA ends the process where an input of such a function is not used: what is empty is
-    # made inside, and of what `fn` may not need a number goes into a witness.
+    # made inside, and of all others a number goes into a witness.
     inputs, empty = eqx.partition((closure, args), lambda x: x.size > 0)
 
-    def with_witness(inputs):
+    def with_empty(inputs):
         made = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), empty)
-        firsts = [_first(x).astype(float) for x in jax.tree.leaves(inputs[0])]
-        out = fn(*eqx.combine(inputs, made))
-        return out, functools.reduce(jnp.add, firsts, jnp.zeros(()))
+        return fn(*eqx.combine(inputs, made))
 
-    out, sign = jax.jit(with_witness)(inputs)
+    program, like = jax.make_jaxpr(with_empty, return_shape=True)(inputs)
+    structure = jax.tree.structure(like)
+    numbers = jax.tree.leaves(inputs)
+    plain = jaxpr_as_fun(program)
+    if not _is_possible(program.jaxpr) or not numbers:
+        return jax.tree.unflatten(structure, plain(*numbers))
+
+    def with_witness(*numbers):
+        firsts = [_first(x).astype(float) for x in numbers]
+        return plain(*numbers), functools.reduce(jnp.add, firsts)
+
+    out, sign = jax.jit(with_witness)(*numbers)
     # The marks go to what made the value: the call.
     witness: Any = set_xla_metadata(sign, **_MARKS)
-    leaves, structure = jax.tree.flatten(out)
     # Nothing here may find that the witness is not needed.
-    leaves[0] = jnp.where(witness > 0, leaves[0], leaves[0])
-    return jax.tree.unflatten(structure, leaves)
+    first = jnp.where(witness > 0, out[0], out[0])
+    return jax.tree.unflatten(structure, [first, *out[1:]])
 
 
 def _first(x: Array) -> Scalar:
@@ -133,7 +138,7 @@ def _is_possible(jaxpr: Jaxpr) -> bool:
             possible = _is_small_product(eqn)
         else:
             possible = name in _POSSIBLE
-        if not possible or not all(map(_is_possible, _inner(eqn.params.values()))):
+        if not possible or not all(map(_is_possible, programs_within(eqn))):
             return False
     return True
 
@@ -151,13 +156,3 @@ def _is_small_product(eqn: Any) -> bool:
     is_thin = max((*sizes[0], *sizes[1]), default=1) < _THIN
     return is_thin or not left or not right
 
-
-def _inner(params: Any) -> Iterator[Jaxpr]:
-    """The programs among the parameters of an equation."""
-    for param in params:
-        if isinstance(param, ClosedJaxpr):
-            yield param.jaxpr
-        elif isinstance(param, Jaxpr):
-            yield param
-        elif isinstance(param, tuple | list):
-            yield from _inner(param)

@@ -18,6 +18,7 @@ from jaxtyping import Array, PyTree
 
 from ._linear import AbstractFactors, kept_factors, linearisable
 from ._newton import max_norm, Newton, newton_iterations, Start
+from ._one_function import in_one_function
 from ._tracing import is_known
 from ._types import Count, Flag, Scalar
 
@@ -110,7 +111,9 @@ def _root(fn, root_finder, args, start, max_iterations):
 def _root_jvp(primals, tangents):
     fn, root_finder, args, start, max_iterations = primals
     t_args = tangents[2]
-    root = _root(fn, root_finder, args, start, max_iterations)
+    # Where derivatives are taken the loop around is no longer one function.
+    search = lambda: _root(fn, root_finder, args, start, max_iterations)
+    root = in_one_function(search)()
     # All that the derivatives of a step need of the search for it.
     root = eqx.tree_at(
         lambda root: (root.value, root.found, root.broken, root.finite),

@@ -1,12 +1,12 @@
 """Traced values and programs: what JAX knows of a function before it runs."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
-from jax.extend.core import Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 
 def is_known(tree: Any) -> bool:
@@ -42,3 +42,42 @@ def evaluate(primitive: Any, values: list[Any], params: dict[str, Any]) -> list[
     functions, params = bound if isinstance(bound, tuple) else ((), bound)
     out = primitive.bind(*functions, *values, **params)
     return list(out) if primitive.multiple_results else [out]
+
+
+# Primitives that only wrap a program, and the parameter that holds it.
+_WRAPPERS = {
+    "jit": "jaxpr",
+    "pjit": "jaxpr",
+    "closed_call": "call_jaxpr",
+    "core_call": "call_jaxpr",
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr",
+    "checkpoint": "jaxpr",
+    "remat2": "jaxpr",
+}
+
+
+def wrapped_program(equation: Any) -> tuple[Jaxpr, list[Any]] | None:
+    """The program, and its constants, where an equation only wraps one."""
+    name = _WRAPPERS.get(equation.primitive.name)
+    if name is None:
+        return None
+    program = equation.params[name]
+    if isinstance(program, ClosedJaxpr):
+        return program.jaxpr, program.consts
+    return program, []
+
+
+def programs_within(equation: Any) -> Iterator[Jaxpr]:
+    """All programs among the parameters of an equation: bodies, branches, what it wraps."""
+    yield from _programs(equation.params.values())
+
+
+def _programs(params: Any) -> Iterator[Jaxpr]:
+    for param in params:
+        if isinstance(param, ClosedJaxpr):
+            yield param.jaxpr
+        elif isinstance(param, Jaxpr):
+            yield param
+        elif isinstance(param, tuple | list):
+            yield from _programs(param)

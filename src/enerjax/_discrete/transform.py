@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array
 
-from .._tracing import evaluate, interpret
+from .._tracing import evaluate, interpret, wrapped_program
 
 
 class Moving(NamedTuple):
@@ -97,14 +97,12 @@ class Walk:
         primitive, params = equation.primitive, equation.params
         if not any(moves(value) for value in values):
             return evaluate(primitive, values, params)
-        inner = _INNER.get(primitive.name)
+        inner = wrapped_program(equation)
         named = self._rules.get(f"jit {params.get('name')}")
         if named is not None:
             return named(values, dict(params, walk=self, primitive=primitive))
         if inner is not None:
-            program = params[inner]
-            consts = program.consts if isinstance(program, ClosedJaxpr) else []
-            return self.open(getattr(program, "jaxpr", program), consts, values)
+            return self.open(*inner, values)
         rule = self._rules.get(primitive.name)
         try:
             if rule is None:
@@ -116,14 +114,3 @@ class Walk:
                 self.fallbacks.append(primitive.name)
             return outs
 
-
-# Primitives that only wrap a program, and the parameter that holds it.
-_INNER = {
-    "jit": "jaxpr",
-    "pjit": "jaxpr",
-    "closed_call": "call_jaxpr",
-    "custom_jvp_call": "call_jaxpr",
-    "custom_vjp_call": "call_jaxpr",
-    "checkpoint": "jaxpr",
-    "remat2": "jaxpr",
-}

@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 from scipy.sparse import csr_array
 
+from .._one_function import in_one_function
 from .banded import Band, coloured_products, column_colours
-from .dense import AbstractFactors, Inverse, LU, SMALL, solve
+from .dense import AbstractFactors, Inverse, inverse, LU, SMALL, solve
 from .dependence import shape_of
 from .dots import plain_products
 from .given import KLU, LineaxFactors, Scattered
@@ -96,6 +97,9 @@ class Linearisable(eqx.Module):
 
     def _solver(self, x: Float[Array, " n"]) -> Callable[[Array], Array]:
         """Solves with the Jacobian at `x`, filled."""
+        if self.is_dense and self.fill is None and x.size <= SMALL:
+            found = in_one_function(lambda x: inverse(self.jacobian(x)))(x)
+            return lambda right: found @ right
         matrix = self.jacobian(x)
         if self.is_dense:
             # An explicit inverse loses too many digits of what is nearly singular.

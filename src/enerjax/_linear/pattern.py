@@ -13,11 +13,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array
 from scipy.sparse import csr_array
 
-from .._tracing import evaluate, interpret, is_known
+from .._tracing import evaluate, interpret, is_known, wrapped_program
 from .dependence import Constant, Dense, Depends, everything, RULES, Value
 
 
@@ -58,11 +57,10 @@ def _equation(equation: Any, values: list[Value], of_values: bool) -> list[Value
     primitive, params = equation.primitive, equation.params
     avals = [var.aval for var in equation.outvars]
     named = RULES.get(f"jit {params.get('name')}")
-    inner = next((params[k] for k in ("jaxpr", "call_jaxpr") if k in params), None)
-    if named is None and inner is not None and primitive.name in _CALLS:
-        consts = inner.consts if isinstance(inner, ClosedJaxpr) else []
+    inner = wrapped_program(equation)
+    if named is None and inner is not None:
         rule = functools.partial(_equation, of_values=of_values)
-        return interpret(getattr(inner, "jaxpr", inner), consts, values, rule)
+        return interpret(*inner, values, rule)
     if not any(isinstance(v, Depends) for v in values):
         if any(isinstance(v, Constant) for v in values) or primitive.name in _LOOPS:
             return list(map(Constant, avals))
@@ -76,9 +74,5 @@ def _equation(equation: Any, values: list[Value], of_values: bool) -> list[Value
     return [Depends(r, aval) for r, aval in zip(rows, avals, strict=True)]
 
 
-_CALLS = {
-    "jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call",
-    "checkpoint", "remat2",
-}  # fmt: skip
 _LOOPS = {"while", "scan", "cond"}
 _ZERO = {"sign", "floor", "ceil", "round", "stop_gradient", "is_finite"}
