@@ -95,7 +95,9 @@ def test_points_keep_their_momenta(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FREE)
 def test_points_keep_their_momenta_in_long_runs(name):
-    _check_points(name, 100_000, 1e-11)  # round-off, a random walk
+    # Round-off, a random walk. The particles end 250 lengths away from where they began,
+    # and their moment of momentum is rounded that much more.
+    _check_points(name, 100_000, 4e-11 if name == "particles" else 1e-11)
 
 
 TOPS = {
