@@ -120,6 +120,7 @@ def calls(x, k):
         lax.platform_dependent(x, cpu=jnp.sin, default=jnp.cos),
         jax.grad(lambda x: jnp.sum(x * x + jnp.sin(x)))(x),
         checkpoint_name(x, "x"),
+        _one_function.unmerged(jnp.dot)(x, x.T),
         lax.while_loop(lambda c: c[0] < k[0, 1], lambda c: (c[0] + 1, 2 * c[1]), (0, x))[1],
         lax.cond(k[0, 0] > 0, jnp.sin, jnp.cos, x),
         lax.scan(lambda c, y: (c + y, c * y), x[0], x),
@@ -198,10 +199,25 @@ def test_derivatives_and_lanes():
         jax.tree.map(close, jax.jit(lambda of=of: of(whole))(), of(smooth))
 
 
-def test_many_lanes_are_compiled_as_usual():
-    whole = in_one_function(smooth)
-    assert is_marked(jax.vmap(whole), jnp.ones((3, 2, 3)))
-    assert not is_marked(jax.vmap(whole), jnp.ones((2000, 2, 3)))
+def test_lanes_run_one_after_the_other():
+    """Each with its own iterations, and as it does alone, to the bit."""
+    count = lambda x: jax.lax.while_loop(lambda c: c[0] < x[0, 0], _turn, (0.0, x))
+    whole, xs = in_one_function(count), jnp.arange(12000.0).reshape(2000, 2, 3) / 3000
+    lanes = jax.jit(jax.vmap(whole))
+    assert is_marked(lanes, xs)
+    turns, ends = lanes(xs)
+    for lane in (0, 7, 1999):
+        alone = jax.jit(whole)(xs[lane])
+        assert turns[lane] == alone[0] == np.ceil(xs[lane, 0, 0])
+        np.testing.assert_array_equal(ends[lane], alone[1])
+    # Where one lane cannot be one function, they are compiled as usual.
+    not_possible = jax.vmap(in_one_function(jnp.linalg.inv))
+    assert not is_marked(not_possible, jnp.eye(3)[None])
+
+
+def _turn(carry):
+    turns, x = carry
+    return turns + 1, jnp.sin(x) + x
 
 
 def test_steps_of_small_systems_are_one_function():

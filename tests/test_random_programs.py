@@ -113,7 +113,7 @@ STEP = st.one_of(
 
 
 def build(steps):
-    """A scalar function; `noise` perturbs every intermediate value, relatively."""
+    """A scalar function; `noise` perturbs every entry of what is between, relatively."""
 
     def program(x, noise):
         values = [x]
@@ -151,7 +151,7 @@ def _check(steps, point):
     for dtype, increment in itertools.product((jnp.float64, jnp.float32), INCREMENTS):
         a = jnp.asarray(point[:SIZE], dtype)
         b = a + jnp.asarray(increment, dtype) * jnp.asarray(point[SIZE:], dtype)
-        silent = jnp.zeros((len(steps), 2), dtype)
+        silent = jnp.zeros((len(steps), 2, SIZE), dtype)
         assert _defect(program, silent, a, b) <= 50, increment
     # A process can map only so many of them, and no other example has this one.
     _defect.clear_cache()  # pyright: ignore[reportAttributeAccessIssue]

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import jaxlib
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import Jaxpr, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
 from jaxtyping import Array, PyTree
 
 from ._tracing import programs_within
@@ -34,6 +34,7 @@ _THIN = 8
 
 _CALLS = """
     jit remat2 custom_jvp_call custom_vjp_call custom_vmap_call while cond scan
+    xla_metadata_value
 """
 _MOVES = """
     broadcast_in_dim concatenate copy dynamic_slice dynamic_update_slice gather iota pad
@@ -52,77 +53,92 @@ _POSSIBLE = frozenset((_CALLS + _MOVES + _ELEMENTWISE).split())
 _POSSIBLE_IF_SMALL = frozenset(_SUMS.split())
 
 
+def unmerged(fn: Callable[..., Array]) -> Callable[..., Array]:
+    """`fn`, whose operations XLA does not merge with those around it.
+
+    Where one operation needs an entry of another several times, merging computes it as
+    often. The same values either way. Not to be differentiated.
+    """
+    if not _marks():
+        return fn
+    call = jax.jit(fn)
+
+    def apart(*args: Array) -> Array:
+        # The mark goes to what made the value: the call.
+        out: Any = set_xla_metadata(call(*args), inlineable=_MARKS["inlineable"])
+        return out
+
+    return apart
+
+
 def in_one_function(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Array]]:
     """`fn`, between trees of arrays, as one function of machine code where it can be.
 
-    The same values either way. Derivatives, and batches of so many lanes that their
-    operations are no longer small, are compiled as usual.
+    The same values either way. The lanes of a batch run one after the other, each with the
+    iterations that it needs. Derivatives are compiled as usual.
     """
-    if not _KNOWS_MARKS or jax.default_backend() != "cpu":
+    if not _marks():
         return fn
 
     def call(*args: PyTree[Array]) -> PyTree[Array]:
-        return _call(eqx.filter_closure_convert(fn, *args), args)
+        closed, like = jax.make_jaxpr(fn, return_shape=True)(*args)
+        count = len(closed.consts)
+
+        def program(*numbers: Array) -> list[Array]:
+            again = ClosedJaxpr(closed.jaxpr, numbers[:count])
+            return jaxpr_as_fun(again)(*numbers[count:])
+
+        # What `fn` closes over is an input of its own.
+        numbers = tuple(map(jnp.asarray, (*closed.consts, *jax.tree.leaves(args))))
+        call = _call if _is_possible(closed.jaxpr) and numbers else _plain
+        return jax.tree.unflatten(jax.tree.structure(like), call(program, numbers))
 
     return call
 
 
+def _plain(program: Callable[..., list[Array]], numbers: tuple[Array, ...]) -> list[Array]:
+    return program(*numbers)
+
+
 @eqx.filter_custom_jvp
-def _call(program: Callable[..., PyTree[Array]], args: tuple) -> PyTree[Array]:
-    (closure, args), static = eqx.partition((program, args), eqx.is_array)
-
-    def plain(closure: PyTree[Array], args: PyTree[Array]) -> PyTree[Array]:
-        program, own = eqx.combine((closure, args), static)
-        return program(*own)
-
-    one = jax.custom_batching.custom_vmap(functools.partial(_marked, plain))
+def _call(program: Callable[..., list[Array]], numbers: tuple[Array, ...]) -> list[Array]:
+    one = jax.custom_batching.custom_vmap(functools.partial(_marked, program))
 
     @one.def_vmap
-    def many(axis_size, in_batched, *numbers):  # pyright: ignore[reportUnusedFunction]
+    def lanes(axis_size, in_batched, *numbers):  # pyright: ignore[reportUnusedFunction]
+        # One after the other: for few lanes the calls of the operations take longer than
+        # all of a lane, and many do not fit into the cache.
         del axis_size
-        axes = jax.tree.map(lambda batched: 0 if batched else None, tuple(in_batched))
-        out = _marked(jax.vmap(plain, in_axes=axes), *numbers)
-        return out, jax.tree.map(lambda _: True, out)
+        own, shared = eqx.partition(numbers, tuple(in_batched))
+        out = jax.lax.map(lambda lane: one(*eqx.combine(lane, shared)), own)
+        return out, [True] * len(out)
 
-    return one(closure, args)
+    return one(*numbers)
 
 
 @_call.def_jvp
 def _call_jvp(primals, tangents):
-    run = lambda program, args: program(*args)
-    return eqx.filter_jvp(run, primals, tangents)
+    return eqx.filter_jvp(_plain, primals, tangents)
 
 
-def _marked(
-    fn: Callable[[PyTree[Array], PyTree[Array]], PyTree[Array]],
-    closure: PyTree[Array],
-    args: PyTree[Array],
-) -> PyTree[Array]:
+def _marked(program: Callable[..., list[Array]], *numbers: Array) -> list[Array]:
     # XLA ends the process where an input of such a function is not used: what is empty is
     # made inside, and of all others a number goes into a witness.
-    inputs, empty = eqx.partition((closure, args), lambda x: x.size > 0)
+    def with_witness(*inputs):
+        left = iter(inputs)
+        made = lambda x: next(left) if x.size else jnp.zeros(x.shape, x.dtype)
+        firsts = [_first(x).astype(float) for x in inputs]
+        return program(*map(made, numbers)), functools.reduce(jnp.add, firsts, 0.0)
 
-    def with_empty(inputs):
-        made = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), empty)
-        return fn(*eqx.combine(inputs, made))
-
-    program, like = jax.make_jaxpr(with_empty, return_shape=True)(inputs)
-    structure = jax.tree.structure(like)
-    numbers = jax.tree.leaves(inputs)
-    plain = jaxpr_as_fun(program)
-    if not _is_possible(program.jaxpr) or not numbers:
-        return jax.tree.unflatten(structure, plain(*numbers))
-
-    def with_witness(*numbers):
-        firsts = [_first(x).astype(float) for x in numbers]
-        return plain(*numbers), functools.reduce(jnp.add, firsts)
-
-    out, sign = jax.jit(with_witness)(*numbers)
+    out, sign = jax.jit(with_witness)(*(x for x in numbers if x.size))
     # The marks go to what made the value: the call.
     witness: Any = set_xla_metadata(sign, **_MARKS)
     # Nothing here may find that the witness is not needed.
-    first = jnp.where(witness > 0, out[0], out[0])
-    return jax.tree.unflatten(structure, [first, *out[1:]])
+    return [jnp.where(witness > 0, out[0], out[0]), *out[1:]]
+
+
+def _marks() -> bool:
+    return _KNOWS_MARKS and jax.default_backend() == "cpu"
 
 
 def _first(x: Array) -> Scalar:
@@ -155,4 +171,3 @@ def _is_small_product(eqn: Any) -> bool:
         return False
     is_thin = max((*sizes[0], *sizes[1]), default=1) < _THIN
     return is_thin or not left or not right
-

@@ -140,7 +140,7 @@ def _check_not_mixed(tree: Any) -> None:
         raise ValueError(
             "These numbers differ from device to device inside `jax.shard_map`, where JAX "
             "would sum the derivatives that make the step equations over the devices. Pass "
-            "`check_vma=False` to `shard_map`, or shard the inputs of `jit(vmap(...))`."
+            "`check_vma=False` to `shard_map`, or use `sweep`, which takes all devices."
         )
 
 

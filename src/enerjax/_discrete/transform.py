@@ -113,4 +113,3 @@ class Walk:
             if any(isinstance(out, Moving) for out in outs):
                 self.fallbacks.append(primitive.name)
             return outs
-

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from .._one_function import unmerged
 from .._types import Flag, Scalar
 from .norms import largest
 
@@ -21,6 +22,7 @@ from .norms import largest
 SMALL = 32
 # Rows up to which the elimination is written out: it compiles slowly.
 _UNROLLED = 3
+_FEW_ROWS = 8
 
 
 @jax.custom_jvp
@@ -112,12 +114,15 @@ class Inverse(AbstractFactors):
     def renewed(self, matrix: Float[Array, "n n"]) -> "Inverse":
         sizes = jnp.max(jnp.abs(matrix), axis=1)
         matrix = matrix / sizes[:, None]
+        product = unmerged(_product)
+        # The last of a few rows costs less than the call.
+        last = _product if matrix.shape[0] <= _FEW_ROWS else product
         identity = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
 
         def improved(x, e, size):
             """The next inverse, its error `e^3` in factors, and a bound on its size."""
-            square = _product(e, e)
-            x = x + _product(x, e + square)
+            square = product(e, e)
+            x = x + last(x, e + square)
             return x, (e, square), size * _row_sum(square)
 
         def is_rough(carry) -> Flag:
@@ -126,7 +131,7 @@ class Inverse(AbstractFactors):
 
         def turn(carry):
             x, error, size = carry
-            return improved(x, _product(*error), size)
+            return improved(x, product(*error), size)
 
         def is_lost(carry) -> Flag:
             _, _, size = carry
@@ -139,7 +144,7 @@ class Inverse(AbstractFactors):
             one = jnp.where(size < _FAR, 0, jnp.ones_like(size))
             return inverse(one * matrix), error, jnp.zeros_like(size)
 
-        defect = identity - _product(matrix, self.inverse)
+        defect = identity - product(matrix, self.inverse)
         carry = improved(self.inverse, defect, _row_sum(defect))
         carry = jax.lax.while_loop(is_rough, turn, carry)
         return Inverse(jax.lax.while_loop(is_lost, start_again, carry)[0], sizes)
