@@ -9,6 +9,7 @@ from jax.ad_checkpoint import checkpoint_name
 
 import enerjax as ej
 from enerjax import _one_function
+from enerjax._linear.dense import Inverse
 from enerjax._one_function import in_one_function
 from enerjax._tracing import programs_within
 
@@ -120,7 +121,7 @@ def calls(x, k):
         lax.platform_dependent(x, cpu=jnp.sin, default=jnp.cos),
         jax.grad(lambda x: jnp.sum(x * x + jnp.sin(x)))(x),
         checkpoint_name(x, "x"),
-        _one_function.unmerged(jnp.dot)(x, x.T),
+        *_one_function.unmerged(lambda x: (x @ x.T, 2 * x))(x),
         lax.while_loop(lambda c: c[0] < k[0, 1], lambda c: (c[0] + 1, 2 * c[1]), (0, x))[1],
         lax.cond(k[0, 0] > 0, jnp.sin, jnp.cos, x),
         lax.scan(lambda c, y: (c + y, c * y), x[0], x),
@@ -164,6 +165,26 @@ def test_what_is_not_possible_is_left_as_it_is(name):
     left = in_one_function(fn)
     assert not is_marked(left, X)
     np.testing.assert_array_equal(jax.jit(left)(X), jax.jit(fn)(X))
+
+
+@pytest.mark.parametrize("rows", [8, 9, 27, 32])
+def test_inverses_are_renewed_in_one_function(rows):
+    """Without a part that several threads would share, however large."""
+    start = Inverse(jnp.eye(rows), jnp.ones((rows,)))
+    change = jnp.sin(jnp.arange(1.0, 1 + rows**2)).reshape(rows, rows) / rows
+
+    def inverses(change):
+        matrix = lambda t: jnp.eye(rows) + 0.1 * t * change
+        turn = lambda kept, t: (kept.renewed(matrix(t)),) * 2
+        return jax.lax.scan(turn, start, jnp.arange(0.0, 5.0))[1].inverse
+
+    whole = in_one_function(inverses)
+    assert is_marked(whole, change)
+    last = np.eye(rows) + 0.4 * np.asarray(change)
+    # Of the matrix with rows of size one.
+    exact = np.linalg.inv(last / np.max(np.abs(last), axis=1, keepdims=True))
+    # Truncation: errors of 1e-7 are small enough for a chord iteration.
+    np.testing.assert_allclose(jax.jit(whole)(change)[-1], exact, rtol=0, atol=1e-6)
 
 
 def test_inputs_that_are_not_used():

@@ -53,20 +53,23 @@ _POSSIBLE = frozenset((_CALLS + _MOVES + _ELEMENTWISE).split())
 _POSSIBLE_IF_SMALL = frozenset(_SUMS.split())
 
 
-def unmerged(fn: Callable[..., Array]) -> Callable[..., Array]:
+def unmerged(fn: Callable[..., tuple[Array, ...]]) -> Callable[..., tuple[Array, ...]]:
     """`fn`, whose operations XLA does not merge with those around it.
 
     Where one operation needs an entry of another several times, merging computes it as
-    often. The same values either way. Not to be differentiated.
+    often. The same values either way. `fn` must return two arrays or more: XLA would share
+    the work of a call with one result among threads, which is not possible inside of one
+    function. Not to be differentiated.
     """
     if not _marks():
         return fn
     call = jax.jit(fn)
 
-    def apart(*args: Array) -> Array:
+    def apart(*args: Array) -> tuple[Array, ...]:
+        first, *others = call(*args)
         # The mark goes to what made the value: the call.
-        out: Any = set_xla_metadata(call(*args), inlineable=_MARKS["inlineable"])
-        return out
+        first: Any = set_xla_metadata(first, inlineable=_MARKS["inlineable"])
+        return first, *others
 
     return apart
 

@@ -22,7 +22,6 @@ from .norms import largest
 SMALL = 32
 # Rows up to which the elimination is written out: it compiles slowly.
 _UNROLLED = 3
-_FEW_ROWS = 8
 
 
 @jax.custom_jvp
@@ -114,16 +113,11 @@ class Inverse(AbstractFactors):
     def renewed(self, matrix: Float[Array, "n n"]) -> "Inverse":
         sizes = jnp.max(jnp.abs(matrix), axis=1)
         matrix = matrix / sizes[:, None]
-        product = unmerged(_product)
-        # The last of a few rows costs less than the call.
-        last = _product if matrix.shape[0] <= _FEW_ROWS else product
-        identity = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
 
         def improved(x, e, size):
             """The next inverse, its error `e^3` in factors, and a bound on its size."""
-            square = product(e, e)
-            x = x + last(x, e + square)
-            return x, (e, square), size * _row_sum(square)
+            square, both, part = unmerged(_square)(e)
+            return x + _product(x, both), (e, square), size * part
 
         def is_rough(carry) -> Flag:
             _, _, size = carry
@@ -131,7 +125,7 @@ class Inverse(AbstractFactors):
 
         def turn(carry):
             x, error, size = carry
-            return improved(x, product(*error), size)
+            return improved(x, _product(*error), size)
 
         def is_lost(carry) -> Flag:
             _, _, size = carry
@@ -144,8 +138,7 @@ class Inverse(AbstractFactors):
             one = jnp.where(size < _FAR, 0, jnp.ones_like(size))
             return inverse(one * matrix), error, jnp.zeros_like(size)
 
-        defect = identity - product(matrix, self.inverse)
-        carry = improved(self.inverse, defect, _row_sum(defect))
+        carry = improved(self.inverse, *unmerged(_defect)(matrix, self.inverse))
         carry = jax.lax.while_loop(is_rough, turn, carry)
         return Inverse(jax.lax.while_loop(is_lost, start_again, carry)[0], sizes)
 
@@ -193,6 +186,19 @@ def _product(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n 
     # Row by row of `b`: the inner loop is over neighbours, and is vectorised.
     terms = [a[:, k, None] * b[None, k] for k in range(a.shape[1])]
     return functools.reduce(jnp.add, terms) if terms else a @ b
+
+
+def _defect(matrix: Array, inverse: Array) -> tuple[Array, Scalar]:
+    """What an inverse leaves of the identity, and the size of that."""
+    identity = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
+    defect = identity - _product(matrix, inverse)
+    return defect, _row_sum(defect)
+
+
+def _square(e: Float[Array, "n n"]) -> tuple[Array, Array, Scalar]:
+    """`e^2`, `e + e^2` and the size of the first."""
+    square = _product(e, e)
+    return square, e + square, _row_sum(square)
 
 
 def _row_sum(matrix: Float[Array, "n n"]) -> Scalar:
