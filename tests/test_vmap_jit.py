@@ -194,3 +194,19 @@ def test_a_large_batch_with_a_broken_lane(bad):
     np.testing.assert_array_equal(np.isfinite(q).all(axis=1), healthy)
     for lane in (0, 699, count - 1):
         np.testing.assert_allclose(q[lane], three_steps(g[lane], h[lane])[0], **SAME)
+
+
+def test_batches_of_batches_that_share_some_of_their_numbers():
+    """The start does not depend on the step: none of it is batched in the outer batch."""
+    system, start, args = problem("pendulum")
+
+    def end(h, g):
+        here = args | dict(g=g)
+        run = ej.simulate(system, ej.EnergyPreserving(), start, here, h=h, num_steps=10)
+        return run.ys.q[-1]
+
+    hs, gs = jnp.array([[0.01, 0.02], [0.03, 0.04]]), jnp.array([9.0, 10.0, 11.0])
+    inner = jax.vmap(end, in_axes=(None, 0))
+    grid = jax.jit(jax.vmap(jax.vmap(inner, in_axes=(0, None)), in_axes=(0, None)))(hs, gs)
+    for i, j, k in ((0, 0, 0), (1, 0, 2), (1, 1, 1)):
+        np.testing.assert_allclose(grid[i, j, k], end(hs[i, j], gs[k]), **SAME)

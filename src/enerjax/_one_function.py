@@ -112,6 +112,10 @@ def _call(program: Callable[..., list[Array]], numbers: tuple[Array, ...]) -> li
         # One after the other: for few lanes the calls of the operations take longer than
         # all of a lane, and many do not fit into the cache.
         del axis_size
+        if not any(in_batched):
+            # Of a batch whose lanes differ elsewhere. (To call `one` would lead back here.)
+            out = program(*numbers)
+            return out, [False] * len(out)
         own, shared = eqx.partition(numbers, tuple(in_batched))
         out = jax.lax.map(lambda lane: one(*eqx.combine(lane, shared)), own)
         return out, [True] * len(out)
