@@ -200,47 +200,6 @@ def test_inputs_that_are_not_used():
     assert jax.jit(run)(X, K, jnp.zeros((0, 3))) == 400 * K.sum()
 
 
-def smooth(x):
-    return jnp.sum(jnp.sin(x) * jnp.tanh(x[::-1])) * x
-
-
-def test_derivatives_and_lanes():
-    whole, xs = in_one_function(smooth), jnp.stack([X, 2 * X, 3 * X])
-    total = lambda f: lambda x: jnp.sum(f(x) ** 2)
-    for of in (
-        lambda f: f(X),
-        lambda f: jax.jvp(f, (X,), (X,)),
-        lambda f: jax.grad(total(f))(X),
-        lambda f: jax.jvp(jax.grad(total(f)), (X,), (X,)),
-        lambda f: jax.vmap(f)(xs),
-        lambda f: jax.vmap(jax.grad(total(f)))(xs),
-        lambda f: jax.vmap(jax.vmap(f))(xs[None]),
-    ):
-        close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=0)
-        jax.tree.map(close, jax.jit(lambda of=of: of(whole))(), of(smooth))
-
-
-def test_lanes_run_one_after_the_other():
-    """Each with its own iterations, and as it does alone, to the bit."""
-    count = lambda x: jax.lax.while_loop(lambda c: c[0] < x[0, 0], _turn, (0.0, x))
-    whole, xs = in_one_function(count), jnp.arange(12000.0).reshape(2000, 2, 3) / 3000
-    lanes = jax.jit(jax.vmap(whole))
-    assert is_marked(lanes, xs)
-    turns, ends = lanes(xs)
-    for lane in (0, 7, 1999):
-        alone = jax.jit(whole)(xs[lane])
-        assert turns[lane] == alone[0] == np.ceil(xs[lane, 0, 0])
-        np.testing.assert_array_equal(ends[lane], alone[1])
-    # Where one lane cannot be one function, they are compiled as usual.
-    not_possible = jax.vmap(in_one_function(jnp.linalg.inv))
-    assert not is_marked(not_possible, jnp.eye(3)[None])
-
-
-def _turn(carry):
-    turns, x = carry
-    return turns + 1, jnp.sin(x) + x
-
-
 def test_steps_of_small_systems_are_one_function():
     system, start, args = ej.problems.pendulum()
     run = lambda args: ej.simulate(

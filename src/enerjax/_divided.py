@@ -64,7 +64,7 @@ def solve_or_divide(
     # Not stored for the reverse pass, but done again there: it is rare.
     forget = jax.checkpoint_policies.nothing_saveable
     failed = (whole.result != RESULTS.successful) & ~skip
-    # Lanes of a batch share the program: it runs if one of them needs it.
+    # Lanes that take their steps together share the program: it runs if one needs it.
     return jax.lax.cond(
         anywhere(failed), jax.checkpoint(divided, policy=forget), lambda: (whole, none)
     )

@@ -19,10 +19,10 @@ if jaxlib.version.__version_info__ >= (0, 10, 2):
 def enable_fast_loops() -> None:
     """Let XLA compile a whole time loop into one function, on CPUs.
 
-    Derivatives, batches and steps of more unknowns are then several times faster, and
-    compile sooner; loops over the steps of small systems are compiled so without it. It is
-    your decision, as it holds for all of JAX in the process: it appends to the environment
-    variable `XLA_FLAGS` and starts the CPU back end. Call it right after the imports,
+    Larger systems (of 64 unknowns and more) and derivatives of runs are then faster, the
+    latter up to twice; loops over the steps of small systems are compiled so without it. It
+    is your decision, as it holds for all of JAX in the process: it appends to the
+    environment variable `XLA_FLAGS` and starts the CPU back end. Call it right after the imports,
     before the first array is made (and after `jax.distributed.initialize`, if you use it).
     Other processors are not affected.
 

@@ -1,14 +1,15 @@
-"""Loops over the steps of small systems as one function of machine code, on CPUs.
+"""Computations of small systems as one function of machine code, on CPUs.
 
-XLA's CPU back end calls a function for each of the hundred or so array operations of a
-step, and the calls take longer than the operations. It has a remedy for small loops (see
-`_fast_loops.py`), which compiles all of a computation into one function, and it takes any
-call that is marked as one of these. Not every operation is possible inside: only those
-which need nothing from the runtime.
+These are loops over steps and, where derivatives are taken, the search for a root and the
+inverse at it. XLA's CPU back end calls a function for each of the hundred or so array
+operations of a step, and the calls take longer than the operations. It has a remedy for
+small loops (see `_fast_loops.py`), which compiles all of a computation into one function,
+and it takes any call that is marked as one of these. Not every operation is possible
+inside: only those which need nothing from the runtime.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -85,15 +86,16 @@ def in_one_function(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Ar
 
     def call(*args: PyTree[Array]) -> PyTree[Array]:
         closed, like = jax.make_jaxpr(fn, return_shape=True)(*args)
-        count = len(closed.consts)
+        # Not the closed one: its constants can be traced, and would outlive their trace.
+        jaxpr, count = closed.jaxpr, len(closed.consts)
 
         def program(*numbers: Array) -> list[Array]:
-            again = ClosedJaxpr(closed.jaxpr, numbers[:count])
+            again = ClosedJaxpr(jaxpr, numbers[:count])
             return jaxpr_as_fun(again)(*numbers[count:])
 
         # What `fn` closes over is an input of its own.
         numbers = tuple(map(jnp.asarray, (*closed.consts, *jax.tree.leaves(args))))
-        call = _call if _is_possible(closed.jaxpr) and numbers else _plain
+        call = _call if _is_possible(jaxpr) and numbers else _plain
         return jax.tree.unflatten(jax.tree.structure(like), call(program, numbers))
 
     return call
@@ -125,7 +127,19 @@ def _call(program: Callable[..., list[Array]], numbers: tuple[Array, ...]) -> li
 
 @_call.def_jvp
 def _call_jvp(primals, tangents):
-    return eqx.filter_jvp(_plain, primals, tangents)
+    _, numbers = primals
+    # Under `vmap` JAX takes the axis of the lanes from the function itself, for what this
+    # rule returns too, and does not compare: there it is the first one, of every output.
+    # Here a loop puts it second, and an output can have none.
+    sign = jax.lax.stop_gradient(_witness(numbers))
+
+    def lanes_first(x: Array) -> Array:
+        x = jnp.where(sign > 0, x, x)
+        # A change of shape has the lanes first.
+        return jax.lax.reshape(jax.lax.reshape(x, (1, *x.shape)), x.shape)
+
+    run = lambda program, numbers: list(map(lanes_first, program(*numbers)))
+    return eqx.filter_jvp(run, primals, tangents)
 
 
 def _marked(program: Callable[..., list[Array]], *numbers: Array) -> list[Array]:
@@ -134,8 +148,7 @@ def _marked(program: Callable[..., list[Array]], *numbers: Array) -> list[Array]
     def with_witness(*inputs):
         left = iter(inputs)
         made = lambda x: next(left) if x.size else jnp.zeros(x.shape, x.dtype)
-        firsts = [_first(x).astype(float) for x in inputs]
-        return program(*map(made, numbers)), functools.reduce(jnp.add, firsts, 0.0)
+        return program(*map(made, numbers)), _witness(inputs)
 
     out, sign = jax.jit(with_witness)(*(x for x in numbers if x.size))
     # The marks go to what made the value: the call.
@@ -148,8 +161,11 @@ def _marks() -> bool:
     return _KNOWS_MARKS and jax.default_backend() == "cpu"
 
 
-def _first(x: Array) -> Scalar:
-    return jax.lax.slice(x, (0,) * x.ndim, (1,) * x.ndim).reshape(())
+def _witness(arrays: Sequence[Array]) -> Scalar:
+    """A number to which each of some arrays contributes."""
+    first = lambda x: jax.lax.slice(x, (0,) * x.ndim, tuple(min(n, 1) for n in x.shape))
+    parts = (jnp.real(jnp.sum(first(x))).astype(float) for x in arrays)
+    return functools.reduce(jnp.add, parts, jnp.zeros(()))
 
 
 def _is_possible(jaxpr: Jaxpr) -> bool:

@@ -39,22 +39,27 @@ def _cholesky_jvp(primals, tangents):
     return root, root @ (jnp.tril(inner, -1) + half * inner)
 
 
-@jax.custom_jvp
 def eigh(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """Eigenvalues, in no order, and eigenvectors of a symmetric matrix."""
-    size = matrix.shape[0]
-    if size > SMALL:
+    if matrix.shape[0] == 1:
+        # Its vector is the same in every lane of a batch, its tangent formally not: under
+        # `vmap` the two below must have the same lanes.
+        return matrix[0], jnp.ones_like(matrix)
+    return _eigh(matrix)
+
+
+@jax.custom_jvp
+def _eigh(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    if matrix.shape[0] > SMALL:
         values, vectors = jnp.linalg.eigh(matrix)
         return values, vectors
-    if size == 1:
-        return matrix[0], jnp.ones_like(matrix)
     return _jacobi(matrix)
 
 
-@eigh.defjvp
+@_eigh.defjvp
 def _eigh_jvp(primals, tangents):
     (x,), (dx,) = primals, tangents
-    values, vectors = eigh(x)
+    values, vectors = _eigh(x)
     inner = vectors.T @ (0.5 * (dx + dx.T)) @ vectors
     gap = values[None, :] - values[:, None]
     # Within equal eigenvalues the vectors are not determined: they stay.

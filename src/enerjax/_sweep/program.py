@@ -11,8 +11,9 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jax.sharding import Mesh, PartitionSpec
 
 
-# Measured (benchmarks/batch.py): more lanes at once leave the cache of a core, and all wait
-# for the slowest. Other processors take what fits.
+# Measured (benchmarks/batch.py), for lanes that take their steps together: more at once
+# leave the cache of a core, and all wait for the slowest. (Those of small systems run one
+# after the other in any case.) Other processors take what fits.
 _TOGETHER_ON_CPU = 16
 
 
@@ -50,7 +51,7 @@ class Chunk:
 
     Each device takes an equal part, and goes through it by `together` lanes. (Under a plain
     `jit` all devices would have to agree, in each iteration of Newton's method, whether the
-    last lane of all is done.)
+    last lane of all is done, or to run all the lanes one after the other.)
     """
 
     def __init__(self, lane: Callable, lanes: int, together: int | None):

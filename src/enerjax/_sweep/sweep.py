@@ -57,7 +57,8 @@ def sweep(
     - `chunk`: how many lanes are computed, reported and written at a time; rounded down to
       make them equal.
     - `batch_size`: how many lanes take their steps together. They wait for the slowest of
-      them. By default 16 on CPUs, and as many as there are elsewhere.
+      them (on CPUs not those of small systems, which run one after the other). By default
+      16 on CPUs, and as many as there are elsewhere.
     - `sort_by`: the name of the parameter that the work of a lane depends on most, such as
       `h` if all runs end at the same time: lanes that take their steps together are then
       alike.

@@ -1,0 +1,165 @@
+"""Lanes and derivatives of what is one function of machine code, and of both together."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import enerjax as ej
+from enerjax._linear import eigh
+from enerjax._newton import Newton
+from enerjax._one_function import in_one_function
+from enerjax._root import find_root
+
+from .test_one_function import is_marked, pytestmark, X
+
+
+__all__ = ["pytestmark"]
+
+
+def smooth(x):
+    return jnp.sum(jnp.sin(x) * jnp.tanh(x[::-1])) * x
+
+
+def test_derivatives_and_lanes():
+    whole, xs = in_one_function(smooth), jnp.stack([X, 2 * X, 3 * X])
+    total = lambda f: lambda x: jnp.sum(f(x) ** 2)
+    for of in (
+        lambda f: f(X),
+        lambda f: jax.jvp(f, (X,), (X,)),
+        lambda f: jax.grad(total(f))(X),
+        lambda f: jax.jvp(jax.grad(total(f)), (X,), (X,)),
+        lambda f: jax.vmap(f)(xs),
+        lambda f: jax.vmap(jax.grad(total(f)))(xs),
+        lambda f: jax.vmap(jax.vmap(f))(xs[None]),
+    ):
+        close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=0)
+        jax.tree.map(close, jax.jit(lambda of=of: of(whole))(), of(smooth))
+
+
+def test_lanes_run_one_after_the_other():
+    """Each with its own iterations, and as it does alone, to the bit."""
+    count = lambda x: jax.lax.while_loop(lambda c: c[0] < x[0, 0], _turn, (0.0, x))
+    whole, xs = in_one_function(count), jnp.arange(12000.0).reshape(2000, 2, 3) / 3000
+    lanes = jax.jit(jax.vmap(whole))
+    assert is_marked(lanes, xs)
+    turns, ends = lanes(xs)
+    for lane in (0, 7, 1999):
+        alone = jax.jit(whole)(xs[lane])
+        assert turns[lane] == alone[0] == np.ceil(xs[lane, 0, 0])
+        np.testing.assert_array_equal(ends[lane], alone[1])
+    # Where one lane cannot be one function, they are compiled as usual.
+    not_possible = jax.vmap(in_one_function(jnp.linalg.inv))
+    assert not is_marked(not_possible, jnp.eye(3)[None])
+
+
+def _turn(carry):
+    turns, x = carry
+    return turns + 1, jnp.sin(x) + x
+
+
+# Derivatives of batches ------------------------------------------------------------------
+
+
+def many_outputs(x, y):
+    """A loop has its lanes second, the middle one is of `x` alone, the last of neither."""
+    turn = lambda c, _: (jnp.sin(c) * y, jnp.cos(c) + c)
+    end, rows = jax.lax.scan(turn, x, None, length=3)
+    return rows, x**2, jnp.arange(2.0) + 0 * end[0], end
+
+
+def root(x, y):
+    fn = lambda z, args: z**3 + args[0] * z - args[1]
+    guess = jnp.ones((2,))
+    found = find_root(fn, Newton(), guess, (x, y), max_iterations=30)
+    return found.value
+
+
+OSCILLATOR = ej.System(
+    lambda v, a: 0.5 * v @ v, lambda q, a: 0.5 * a["k"] * q @ q + q[0] ** 4
+)
+
+
+def vectors(x, y):
+    return [eigh(y * (jnp.diag(x) + jnp.outer(x, x))[:n, :n]) for n in (1, 2)]
+
+
+def run(x, y):
+    start = ej.State(x, jnp.zeros((2,)))
+    solution = ej.simulate(
+        OSCILLATOR, ej.EnergyPreserving(), start, {"k": y}, h=0.1, num_steps=6, throw=False
+    )
+    return solution.ys.q, solution.audit.energy
+
+
+def one_step(x, y):
+    start = ej.State(x, jnp.zeros((2,)))
+    return ej.step(OSCILLATOR, ej.EnergyPreserving(), start, {"k": y}, h=0.1).state.q
+
+
+XS, YS = jnp.array([[0.5, 0.2], [0.9, 0.4], [0.7, 0.8]]), jnp.array([1.0, 1.5, 2.0])
+# Traced before their lanes are known, as runs and steps are anyway.
+FUNCTIONS = dict(
+    outputs=jax.jit(in_one_function(many_outputs)),
+    root=jax.jit(root),
+    vectors=jax.jit(vectors),
+    run=run,
+    one_step=one_step,
+)
+# Which of the two inputs differ from lane to lane.
+BATCHED = {"both": (0, 0), "first": (0, None), "second": (None, 0)}
+
+
+def weighed(fn):
+    """A scalar that treats no two entries alike."""
+
+    def total(*args):
+        flat = [jnp.ravel(x) for x in jax.tree.leaves(fn(*args))]
+        return sum(jnp.sum(jnp.sin(jnp.arange(1.0, 1 + x.size)) * x**2) for x in flat)
+
+    return total
+
+
+def lanes_by_hand(fn, axes):
+    """What `vmap` means."""
+
+    def call(x, y):
+        of_lane = lambda a, axis, k: a if axis is None else a[k]
+        lane = lambda k: fn(*(of_lane(*pair, k) for pair in zip((x, y), axes, strict=True)))
+        return jax.tree.map(lambda *xs: jnp.stack(xs), *map(lane, range(3)))
+
+    return call
+
+
+@pytest.mark.parametrize("jit", [False, True])
+@pytest.mark.parametrize("axes", BATCHED.values(), ids=BATCHED)
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_derivatives_of_batches(name, axes, jit):
+    """Values, too: JAX compares neither with those of the function alone."""
+    fn = FUNCTIONS[name]
+    point = tuple(a if axis == 0 else a[0] for a, axis in zip((XS, YS), axes, strict=True))
+    along = jax.tree.map(lambda x: jnp.cos(x), point)
+    wrap = jax.jit if jit else lambda f: f
+
+    def seen(batch):
+        total = weighed(batch)
+        return (
+            wrap(lambda *at: jax.jvp(batch, at, along))(*point),
+            wrap(jax.value_and_grad(total, argnums=(0, 1)))(*point),
+            wrap(lambda *at: jax.jvp(jax.grad(total, argnums=(0, 1)), at, along))(*point),
+        )
+
+    found = seen(jax.vmap(fn, in_axes=axes))
+    expected = seen(lanes_by_hand(fn, axes))
+    # Round-off, and where Newton stops; second derivatives are some tens in size.
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10)
+    jax.tree.map(close, found, expected)
+
+
+def test_nothing_outlives_its_trace():
+    @jax.jit
+    def closes_over(x, a):
+        return in_one_function(lambda y: jnp.sin(a * y))(x)
+
+    with jax.checking_leaks():
+        assert closes_over(1.0, 2.0) == np.sin(2.0)
