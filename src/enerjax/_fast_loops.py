@@ -22,9 +22,9 @@ def enable_fast_loops() -> None:
     Larger systems (of 64 unknowns and more) and derivatives of runs are then faster, the
     latter up to twice; loops over the steps of small systems are compiled so without it. It
     is your decision, as it holds for all of JAX in the process: it appends to the
-    environment variable `XLA_FLAGS` and starts the CPU back end. Call it right after the imports,
-    before the first array is made (and after `jax.distributed.initialize`, if you use it).
-    Other processors are not affected.
+    environment variable `XLA_FLAGS` and starts the CPU back end. Call it right after the
+    imports, before the first array is made (and after `jax.distributed.initialize`, if you
+    use it). Other processors are not affected.
 
     **Raises:** `RuntimeError` if the back end had started before, so that the setting came
     too late (or was not understood by this version of XLA).
