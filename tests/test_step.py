@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 
 import enerjax as ej
@@ -170,10 +171,9 @@ def test_a_composition_is_its_stages_one_after_the_other():
     np.testing.assert_allclose(whole.multipliers, impulse, rtol=0, atol=1e-9)
 
 
-def test_another_root_finder_can_be_given():
+@pytest.mark.parametrize("name", ["Newton", "Chord", "Dogleg", "LevenbergMarquardt"])
+def test_another_root_finder_can_be_given(name):
     """The step equations are scaled, so a plain tolerance of a library does."""
-    import optimistix as optx
-
     system, start, args = problem("pendulum")
     run = ej.simulate(
         system,
@@ -182,7 +182,7 @@ def test_another_root_finder_can_be_given():
         args,
         h=H,
         num_steps=20,
-        root_finder=optx.Newton(rtol=1e-12, atol=1e-12),
+        root_finder=getattr(optx, name)(rtol=1e-12, atol=1e-12),
     )
     ours = solve("pendulum", "preserving", 0.0, h=H, steps=STEPS)
     # Solver: its tolerance, over twenty steps.

@@ -127,19 +127,18 @@ def _call(program: Callable[..., list[Array]], numbers: tuple[Array, ...]) -> li
 
 @_call.def_jvp
 def _call_jvp(primals, tangents):
-    _, numbers = primals
+    out, rates = eqx.filter_jvp(_plain, primals, tangents)
     # Under `vmap` JAX takes the axis of the lanes from the function itself, for what this
     # rule returns too, and does not compare: there it is the first one, of every output.
-    # Here a loop puts it second, and an output can have none.
-    sign = jax.lax.stop_gradient(_witness(numbers))
+    # Here a loop puts it second, and an output can have none. (Rates follow their values.)
+    sign = jax.lax.stop_gradient(_witness(primals[1]))
 
     def lanes_first(x: Array) -> Array:
         x = jnp.where(sign > 0, x, x)
         # A change of shape has the lanes first.
         return jax.lax.reshape(jax.lax.reshape(x, (1, *x.shape)), x.shape)
 
-    run = lambda program, numbers: list(map(lanes_first, program(*numbers)))
-    return eqx.filter_jvp(run, primals, tangents)
+    return list(map(lanes_first, out)), rates
 
 
 def _marked(program: Callable[..., list[Array]], *numbers: Array) -> list[Array]:

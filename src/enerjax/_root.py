@@ -25,7 +25,7 @@ from ._types import Count, Flag, Scalar
 
 # The name under which a policy of `jax.checkpoint` knows the value of a root.
 ROOT = "enerjax_root"
-RootFinder: TypeAlias = Newton | optx.AbstractRootFinder
+RootFinder: TypeAlias = Newton | optx.AbstractRootFinder | optx.AbstractLeastSquaresSolver
 
 
 class Root(eqx.Module):
@@ -76,6 +76,8 @@ def _search(
         )
         steps = solution.stats["num_steps"]
         residual = max_norm(fn(solution.value, args))
+        # Tolerances finer than the unknowns can be resolved end at `max_iterations`.
+        found = found | (residual <= Newton().atol * jnp.finfo(residual.dtype).eps)
         return Root(
             solution.value,
             start.factors,

@@ -35,8 +35,9 @@ def prepare(
     """Checked start, `args` of arrays, and `h` and `t` in the dtype of the start."""
     if not isinstance(root_finder, RootFinder):
         raise TypeError(
-            "`root_finder` must be a root finder such as `enerjax.Newton()` or one of "
-            f"optimistix, got {root_finder!r}."
+            "`root_finder` must be a root finder such as `enerjax.Newton()`, or one of "
+            "optimistix, or a solver of its for least squares, such as "
+            f"`LevenbergMarquardt(rtol, atol)`; got {root_finder!r}."
         )
     if not isinstance(scheme, AbstractScheme):
         raise TypeError(

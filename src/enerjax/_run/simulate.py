@@ -85,7 +85,7 @@ def simulate(
       Derivatives are those of the steps as they were chosen, as parts of `t1 - t0`.
     - `t0`: the time of the start; step `k` begins at `t0 + k h`. Traced.
     - `root_finder`: for the step equations, which are scaled to order one (so tolerances
-      are relative); one of optimistix can be given.
+      are relative); one of optimistix can be given, or a solver of its for least squares.
     - `max_halvings`: a step that fails is tried again in 2, 4, up to `2 ** max_halvings`
       equal parts, in which the laws of the energy hold as in a whole one; 0 for never.
       Where it is not given: 3 for systems of many unknowns, else 0, for it makes the
