@@ -200,6 +200,21 @@ def test_inputs_that_are_not_used():
     assert jax.jit(run)(X, K, jnp.zeros((0, 3))) == 400 * K.sum()
 
 
+@pytest.mark.parametrize("length", [1000, 2000])
+def test_tables_that_are_looked_up(length):
+    """Large constants end the process inside of such a function: these stay outside."""
+    table = np.sin(np.linspace(0, 1, length))
+
+    def follow(x):
+        """To places that the table tells."""
+        place = lambda x: jnp.floor(x * length).astype(int)
+        return jax.lax.fori_loop(0, 5, lambda _, x: jnp.asarray(table)[place(x)], x)
+
+    whole = in_one_function(follow)
+    assert is_marked(whole, 0.9) == (length <= 1024)
+    assert jax.jit(whole)(0.9) == follow(0.9)
+
+
 def test_steps_of_small_systems_are_one_function():
     system, start, args = ej.problems.pendulum()
     run = lambda args: ej.simulate(

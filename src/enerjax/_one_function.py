@@ -32,6 +32,9 @@ _MARKS = {"xla_cpu_small_call": "true", "inlineable": "false"}
 _FEW = 2048
 # Rows or columns from which it does for products of matrices.
 _THIN = 8
+# Bytes of an input that may turn out to be a constant (a table that a function looks up):
+# above 10000 XLA ends the process, as it then has no address for it.
+_LARGEST_INPUT = 8192
 
 _CALLS = """
     jit remat2 custom_jvp_call custom_vjp_call custom_vmap_call while cond scan
@@ -95,8 +98,9 @@ def in_one_function(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Ar
 
         # What `fn` closes over is an input of its own.
         numbers = tuple(map(jnp.asarray, (*closed.consts, *jax.tree.leaves(args))))
-        call = _call if _is_possible(jaxpr) and numbers else _plain
-        return jax.tree.unflatten(jax.tree.structure(like), call(program, numbers))
+        possible = _is_possible(jaxpr) and _are_inputs(numbers)
+        out = (_call if possible else _plain)(program, numbers)
+        return jax.tree.unflatten(jax.tree.structure(like), out)
 
     return call
 
@@ -165,6 +169,10 @@ def _witness(arrays: Sequence[Array]) -> Scalar:
     first = lambda x: jax.lax.slice(x, (0,) * x.ndim, tuple(min(n, 1) for n in x.shape))
     parts = (jnp.real(jnp.sum(first(x))).astype(float) for x in arrays)
     return functools.reduce(jnp.add, parts, jnp.zeros(()))
+
+
+def _are_inputs(numbers: tuple[Array, ...]) -> bool:
+    return len(numbers) > 0 and max(x.nbytes for x in numbers) <= _LARGEST_INPUT
 
 
 def _is_possible(jaxpr: Jaxpr) -> bool:
