@@ -37,9 +37,10 @@ def run(
 
     `rows_of` makes the rows of one setting, in a process of its own, and `peers` those of
     other programs, here (twice where they tell their time of a step); both are told whether
-    a quick look is wanted. `modes`: the settings of XLA. They are shown, drawn, and saved under the name of the script. With
-    `works` both also take names of these, one or all of them; rows tell theirs as `work`,
-    and those of one that is run again replace what was saved.
+    a quick look is wanted. `modes`: the settings of XLA. They are shown, drawn, and saved
+    under the name of the script. With `works` both also take names of these, one or all of
+    them; rows tell theirs as `work`, and those of one that is run again replace what was
+    saved.
     """
     chosen = _options(sys.modules["__main__"].__doc__ or "", works)
     asked = (
