@@ -156,6 +156,24 @@ def test_derivatives_of_batches(name, axes, jit):
     jax.tree.map(close, found, expected)
 
 
+def test_inputs_that_turn_out_to_be_constant():
+    """XLA must not put them inside: inputs that are not used end the process."""
+    # The sort keeps the step from being one function; the search for the start is one.
+    potential = lambda q, a: 9.81 * q[1] + 1e-3 * jnp.sum(jnp.sort(q) ** 2)
+    constraint = lambda q, a: jnp.array([q @ q - a["l"] ** 2])
+    system = ej.System(lambda v, a: 0.5 * v @ v, potential, constraint)
+
+    def end(length):
+        args = {"l": length}
+        start = ej.initial_state(system, length * jnp.array([0.6, 0.8]), jnp.zeros(2), args)
+        return ej.step(system, ej.EnergyPreserving(), start, args, h=0.05).state.q
+
+    _, rate = jax.jit(lambda x: jax.jvp(end, (x,), (1.0,)))(1.2)
+    difference = (end(1.2 + 1e-5) - end(1.2 - 1e-5)) / 2e-5
+    # Truncation of the difference and round-off over its width.
+    np.testing.assert_allclose(rate, difference, rtol=0, atol=1e-9)
+
+
 def test_nothing_outlives_its_trace():
     @jax.jit
     def closes_over(x, a):

@@ -153,7 +153,9 @@ def _marked(program: Callable[..., list[Array]], *numbers: Array) -> list[Array]
         made = lambda x: next(left) if x.size else jnp.zeros(x.shape, x.dtype)
         return program(*map(made, numbers)), _witness(inputs)
 
-    out, sign = jax.jit(with_witness)(*(x for x in numbers if x.size))
+    # Nor may it see that one is a constant, which it would put inside instead of the input.
+    inputs = jax.lax.optimization_barrier([x for x in numbers if x.size])
+    out, sign = jax.jit(with_witness)(*inputs)
     # The marks go to what made the value: the call.
     witness: Any = set_xla_metadata(sign, **_MARKS)
     # Nothing here may find that the witness is not needed.
