@@ -33,7 +33,7 @@ _FEW = 2048
 # Rows or columns from which it does for products of matrices.
 _THIN = 8
 # Bytes of an input that may turn out to be a constant (a table that a function looks up):
-# above 10000 XLA ends the process, as it then has no address for it.
+# XLA has no address for one above 10000, and ends the process where it sees that it is one.
 _LARGEST_INPUT = 8192
 
 _CALLS = """
