@@ -115,7 +115,7 @@ def test_a_shuffled_band_is_found_and_solved(size):
     bound = 1e3 * size * EPS * np.abs(matrix).max()  # round-off
     size_of = np.abs(np.linalg.solve(matrix, right)).max()
     assert np.max(np.abs(matrix @ x - right)) <= bound * size_of
-    y = jax.linear_transpose(factors.solve, right)(jnp.asarray(right))[0]
+    y = jax.vjp(factors.solve, right)[1](jnp.asarray(right))[0]
     size_of = np.abs(np.linalg.solve(matrix.T, right)).max()
     assert np.max(np.abs(matrix.T @ y - right)) <= bound * size_of
 

@@ -200,9 +200,9 @@ def test_inputs_that_are_not_used():
     assert jax.jit(run)(X, K, jnp.zeros((0, 3))) == 400 * K.sum()
 
 
-@pytest.mark.parametrize("length", [1000, 2000])
+@pytest.mark.parametrize("length", [1000, 20000])
 def test_tables_that_are_looked_up(length):
-    """Large constants end the process inside of such a function: these stay outside."""
+    """Large constants end the process inside of such a function: they become inputs."""
     table = np.sin(np.linspace(0, 1, length))
 
     def follow(x):
@@ -211,8 +211,10 @@ def test_tables_that_are_looked_up(length):
         return jax.lax.fori_loop(0, 5, lambda _, x: jnp.asarray(table)[place(x)], x)
 
     whole = in_one_function(follow)
-    assert is_marked(whole, 0.9) == (length <= 1024)
+    assert is_marked(whole, 0.9)
     assert jax.jit(whole)(0.9) == follow(0.9)
+    # Where all is known XLA folds what it can.
+    assert jax.jit(lambda: whole(0.9))() == follow(0.9)
 
 
 def test_steps_of_small_systems_are_one_function():

@@ -32,9 +32,6 @@ _MARKS = {"xla_cpu_small_call": "true", "inlineable": "false"}
 _FEW = 2048
 # Rows or columns from which it does for products of matrices.
 _THIN = 8
-# Bytes of an input that may turn out to be a constant (a table that a function looks up):
-# XLA has no address for one above 10000, and ends the process where it sees that it is one.
-_LARGEST_INPUT = 8192
 
 _CALLS = """
     jit remat2 custom_jvp_call custom_vjp_call custom_vmap_call while cond scan
@@ -98,7 +95,7 @@ def in_one_function(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Ar
 
         # What `fn` closes over is an input of its own.
         numbers = tuple(map(jnp.asarray, (*closed.consts, *jax.tree.leaves(args))))
-        possible = _is_possible(jaxpr) and _are_inputs(numbers)
+        possible = len(numbers) > 0 and _is_possible(jaxpr)
         out = (_call if possible else _plain)(program, numbers)
         return jax.tree.unflatten(jax.tree.structure(like), out)
 
@@ -153,7 +150,8 @@ def _marked(program: Callable[..., list[Array]], *numbers: Array) -> list[Array]
         made = lambda x: next(left) if x.size else jnp.zeros(x.shape, x.dtype)
         return program(*map(made, numbers)), _witness(inputs)
 
-    # Nor may it see that one is a constant, which it would put inside instead of the input.
+    # Nor may it see that one is a constant, which it would put inside instead of the input;
+    # and for one of more than 10 kB (a table that is looked up) it has no address there.
     inputs = jax.lax.optimization_barrier([x for x in numbers if x.size])
     out, sign = jax.jit(with_witness)(*inputs)
     # The marks go to what made the value: the call.
@@ -171,10 +169,6 @@ def _witness(arrays: Sequence[Array]) -> Scalar:
     first = lambda x: jax.lax.slice(x, (0,) * x.ndim, tuple(min(n, 1) for n in x.shape))
     parts = (jnp.real(jnp.sum(first(x))).astype(float) for x in arrays)
     return functools.reduce(jnp.add, parts, jnp.zeros(()))
-
-
-def _are_inputs(numbers: tuple[Array, ...]) -> bool:
-    return len(numbers) > 0 and max(x.nbytes for x in numbers) <= _LARGEST_INPUT
 
 
 def _is_possible(jaxpr: Jaxpr) -> bool:

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from .._one_function import in_one_function
 from .dense import AbstractFactors
 from .dependence import shape_of
 from .elimination import LIBRARY, pivot_rows_first
@@ -116,41 +117,53 @@ class BandFactors(AbstractFactors):
     upper: Float[Array, "blocks width two_widths"]
 
     def renewed(self, matrix: Float[Array, "blocks width three_widths"]) -> "BandFactors":
-        width = self.band.width
-        none = jnp.zeros((width, width), matrix.dtype)
-        # Beyond the last block: rows of no other unknown.
-        beyond = jnp.concatenate([none, jnp.eye(width, dtype=matrix.dtype), none], axis=1)
-        following = jnp.concatenate([matrix[1:], beyond[None]])
-
-        def eliminate(left, rows):
-            whole = jnp.concatenate(
-                [jnp.concatenate([left, none], axis=1), rows]
-            )  # two_widths, three_widths
-            turned, turn = pivot_rows_first(whole, width)
-            return turned[width:], (turn, turned[:width])
-
-        first = matrix[0, :, width:]
-        _, (turns, upper) = jax.lax.scan(eliminate, first, following)
-        return BandFactors(self.band, turns, upper)
+        return BandFactors(self.band, *in_one_function(_eliminated)(matrix))
 
     def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
-        band, width = self.band, self.band.width
-        filled = jnp.append(right, 0)[band.order].reshape(band.num_blocks, width)
-        none = jnp.zeros((width,), right.dtype)
-
-        def forward(left, item):
-            turn, rows = item
-            turned = turn @ jnp.concatenate([left, rows])
-            return turned[width:], turned[:width]
-
-        following = jnp.concatenate([filled[1:], none[None]])
-        _, reduced = jax.lax.scan(forward, filled[0], (self.turns, following))
-
-        def backward(after, item):
-            upper, value = item
-            x = value - upper @ after
-            return jnp.concatenate([x, after[:width]]), x
-
-        after = jnp.concatenate([none, none])
-        _, x = jax.lax.scan(backward, after, (self.upper, reduced), reverse=True)
+        band = self.band
+        filled = jnp.append(right, 0)[band.order].reshape(band.num_blocks, band.width)
+        x = in_one_function(_substituted)(self.turns, self.upper, filled)
         return x.ravel()[band.back]
+
+
+def _eliminated(matrix: Float[Array, "blocks width three_widths"]) -> tuple[Array, Array]:
+    """The `turns` and the `upper` rows of `BandFactors`."""
+    width = matrix.shape[1]
+    none = jnp.zeros((width, width), matrix.dtype)
+    # Beyond the last block: rows of no other unknown.
+    beyond = jnp.concatenate([none, jnp.eye(width, dtype=matrix.dtype), none], axis=1)
+    following = jnp.concatenate([matrix[1:], beyond[None]])
+
+    def eliminate(left, rows):
+        whole = jnp.concatenate(
+            [jnp.concatenate([left, none], axis=1), rows]
+        )  # two_widths, three_widths
+        turned, turn = pivot_rows_first(whole, width)
+        return turned[width:], (turn, turned[:width])
+
+    return jax.lax.scan(eliminate, matrix[0, :, width:], following)[1]
+
+
+def _substituted(
+    turns: Float[Array, "blocks two_widths two_widths"],
+    upper: Float[Array, "blocks width two_widths"],
+    right: Float[Array, "blocks width"],
+) -> Float[Array, "blocks width"]:
+    none = jnp.zeros_like(right[0])
+    width = none.size
+
+    def forward(left, item):
+        turn, rows = item
+        turned = turn @ jnp.concatenate([left, rows])
+        return turned[width:], turned[:width]
+
+    following = jnp.concatenate([right[1:], none[None]])
+    _, reduced = jax.lax.scan(forward, right[0], (turns, following))
+
+    def backward(after, item):
+        rows, value = item
+        x = value - rows @ after
+        return jnp.concatenate([x, after[:width]]), x
+
+    after = jnp.concatenate([none, none])
+    return jax.lax.scan(backward, after, (upper, reduced), reverse=True)[1]

@@ -53,7 +53,9 @@ def _by_hand(rows: Float[Array, "m w"], count: int) -> tuple[Array, Array]:
     carry = whole, jnp.ones((num_rows,), bool), jnp.zeros((count,), numbers.dtype)
     whole, free, places = jax.lax.fori_loop(0, count, column, carry)
     # What is left, in its order: the row of the first, second, ... that is free.
-    number_of = jnp.where(free, jnp.cumsum(free), 0)
+    # (Counted plainly: `cumsum` is not possible in one function.)
+    before = free[None, :] & (numbers[None, :] <= numbers[:, None])
+    number_of = jnp.where(free, jnp.sum(before, axis=1), 0)
     left = jnp.arange(1, num_rows - count + 1)
     rest = jnp.argmax(number_of[None, :] == left[:, None], axis=1)
     whole = whole[jnp.concatenate([places, rest])]

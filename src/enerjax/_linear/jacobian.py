@@ -105,8 +105,8 @@ class Linearisable(eqx.Module):
             # An explicit inverse loses too many digits of what is nearly singular.
             by = solve if self.fill is None else jnp.linalg.solve
             return lambda right: by(matrix, right)
+        matrix = jax.lax.stop_gradient(matrix)
         factors = self.form.empty(x.size, x.dtype).renewed(matrix)
-        factors = jax.lax.stop_gradient(factors)
 
         def product(t: Array) -> Array:
             image = jax.jvp(self.value, (x,), (t,))[1]
@@ -116,7 +116,7 @@ class Linearisable(eqx.Module):
             product,
             right,
             lambda _, right: factors.solve(right),
-            lambda _, right: jax.linear_transpose(factors.solve, right)(right)[0],
+            lambda _, right: jax.vjp(factors.solve, right)[1](right)[0],
         )
 
 
