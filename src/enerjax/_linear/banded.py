@@ -19,6 +19,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from .._one_function import in_one_function
+from .columns import columns_along
 from .dense import AbstractFactors
 from .dependence import shape_of
 from .elimination import LIBRARY, pivot_rows_first
@@ -53,7 +54,7 @@ class Band:
         column = back[columns] - (block - 1) * width
         nowhere = self.num_colours * size
         self.places = np.full((blocks, width, 3 * width), nowhere)
-        self.places[block, row, column] = self.colours[columns] * size + rows
+        self.places[block, row, column] = rows * self.num_colours + self.colours[columns]
         self.filling = np.zeros(self.places.shape)
         short = np.arange(blocks * width - size)
         self.filling[-1, width - 1 - short, 2 * width - 1 - short] = 1
@@ -81,11 +82,11 @@ class Band:
 
 def coloured_products(
     fn: Callable[[Array], Array], x: Float[Array, " n"], colours: np.ndarray
-) -> Float[Array, "colours m"]:
+) -> Float[Array, "m ... colours"]:
     """For each colour the sum of the columns that have it."""
     numbers = jnp.arange(int(colours.max(initial=0)) + 1)
-    seeds = (numbers[:, None] == jnp.asarray(colours)[None, :]).astype(x.dtype)
-    return jax.vmap(lambda seed: jax.jvp(fn, (x,), (seed,))[1])(seeds)
+    seeds = (jnp.asarray(colours)[:, None] == numbers[None, :]).astype(x.dtype)
+    return columns_along(fn, x, seeds)
 
 
 def column_colours(pattern: csr_array, order: np.ndarray) -> np.ndarray:

@@ -57,7 +57,7 @@ class Scattered:
     ) -> Float[Array, " entries"]:
         """The entries of the Jacobian of `fn` at `x`."""
         products = coloured_products(fn, x, self._colours)
-        return products[self._colours[self.columns], self.rows]
+        return products[self.rows, self._colours[self.columns]]
 
     def empty(self, size: int, dtype: Any) -> "ScatteredFactors":
         del size

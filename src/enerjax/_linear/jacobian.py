@@ -13,6 +13,7 @@ from scipy.sparse import csr_array
 
 from .._one_function import in_one_function
 from .banded import Band, coloured_products, column_colours
+from .columns import jacobian_columns
 from .dense import AbstractFactors, Inverse, inverse, LU, SMALL, solve
 from .dependence import shape_of
 from .dots import plain_products
@@ -38,9 +39,9 @@ class Full:
 
     def evaluate(self, fn: Callable[[Array], Array], x: Float[Array, " n"]) -> Array:
         if self._colours is None:
-            return jax.jacfwd(fn)(x)
-        columns = coloured_products(fn, x, self._colours)[self._colours]
-        return jnp.where(self._filled, columns.T, 0)
+            return jacobian_columns(fn, x)
+        columns = coloured_products(fn, x, self._colours)[:, self._colours]
+        return jnp.where(self._filled, columns, 0)
 
     def empty(self, size: int, dtype: Any) -> AbstractFactors:
         if self.solver is None:
@@ -197,7 +198,7 @@ class RowPattern:
         products = coloured_products(fn, x, self._colours)
         num_rows, width = self.columns.shape
         numbers = np.arange(num_rows)
-        entries = products[self._colours[self.columns], numbers[:, None]]
+        entries = products[numbers[:, None], ..., self._colours[self.columns]]
         entries = jnp.moveaxis(entries, 1, -1)
         shape = (num_rows, *[1] * (entries.ndim - 2), width)
         return entries * jnp.asarray(self._filled, x.dtype).reshape(shape)

@@ -1,0 +1,80 @@
+"""Columns of Jacobians, computed side by side."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from enerjax._linear.columns import columns_along, jacobian_columns
+from enerjax._linear.dense import inverse
+
+
+X = jnp.linspace(0.2, 0.8, 6)
+TABLE = jnp.sin(jnp.arange(12.0).reshape(3, 4))
+
+
+def arithmetic(x):
+    y = jnp.sin(x[:3]) * x[3:] / (1 + x[:3] ** 2) - jnp.exp(x[0])
+    return jnp.where(x > 0.5, jnp.concatenate([y, -y]), x**3) + 2
+
+
+def moves(x):
+    table = jnp.pad(x.reshape(2, 3).T, ((1, 0), (0, 2)))
+    parts = jnp.split(table[::2, 1:], [1], axis=1)
+    parts.append(jax.lax.reshape(table, (2, 8), (1, 0)))
+    return jnp.concatenate([part.ravel() for part in parts] + [jnp.ones(2)])
+
+
+def lines_up(x):
+    """With operands of which only some depend on `x`."""
+    padded = jax.lax.pad(jnp.ones(2), x[0], ((1, 2, 1),))
+    return jnp.concatenate([padded, x, jnp.stack([x[1], jnp.ones(())])])
+
+
+def products(x):
+    matrix = x.reshape(2, 3)
+    return jnp.concatenate([TABLE.T @ x[:3], (matrix @ matrix.T).ravel(), (x @ x)[None]])
+
+
+def loops(x):
+    after = jax.lax.fori_loop(0, 3, lambda k, y: y * x + jnp.roll(y, 1), x)
+    sums = jax.lax.scan(lambda c, y: (c + y, c * y), 1.0, x)[1]
+    return jnp.concatenate([after, sums, jnp.cumsum(x), x[jnp.array([4, 0])]])
+
+
+def others(x):
+    matrix = inverse(jnp.eye(4) + jnp.outer(x[:4], x[2:]))
+    top = jax.lax.cond(x[0] > 0, jnp.sin, jnp.cos, x).at[1].add(x[2])
+    return jnp.concatenate([matrix[0], top, jnp.sort(-x), jax.nn.relu(x - 0.5)])
+
+
+def nothing(x):
+    return jnp.ones(2)
+
+
+FUNCTIONS = [arithmetic, moves, lines_up, products, loops, others, nothing]
+
+
+@pytest.mark.parametrize("fn", FUNCTIONS)
+def test_columns_are_those_of_the_jacobian(fn):
+    """Alone, of each lane of a batch, and their own derivatives."""
+    at = jax.jit(lambda x: jacobian_columns(fn, x))(X)
+    np.testing.assert_allclose(at, jax.jacfwd(fn)(X), rtol=0, atol=1e-14)  # round-off
+    xs = jnp.stack([X, X**2])
+    for transform in (
+        lambda jacobian: jax.vmap(jacobian)(xs),
+        lambda jacobian: jax.jvp(jacobian, (X,), (jnp.cos(X),))[1],
+        lambda jacobian: jax.grad(lambda x: jnp.sum(jnp.sin(jacobian(x))))(X),
+    ):
+        ours = jax.jit(lambda f=transform: f(lambda x: jacobian_columns(fn, x)))()
+        theirs = jax.jit(lambda f=transform: f(jax.jacfwd(fn)))()
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-13)  # round-off
+
+
+def test_columns_along_seeds():
+    """Of a function whose values have axes of their own."""
+    fn = lambda x: jnp.sin(x.reshape(2, 3)) * x[0]
+    seeds = jnp.cos(jnp.arange(24.0).reshape(6, 4))
+    ours = columns_along(fn, X, seeds)
+    assert ours.shape == (2, 3, 4)
+    np.testing.assert_allclose(ours, jax.jacfwd(fn)(X) @ seeds, rtol=0, atol=1e-14)
