@@ -36,6 +36,13 @@ def products(x):
     return jnp.concatenate([TABLE.T @ x[:3], (matrix @ matrix.T).ravel(), (x @ x)[None]])
 
 
+def large_sums(x):
+    """Of 768 entries for each column, which are taken in parts, and of too many."""
+    few = jnp.sin(jnp.arange(128.0))[:, None] * x[None]
+    many = jnp.cos(jnp.arange(6000.0))[:, None] * x[None] / 100
+    return jnp.concatenate([jnp.sum(few, axis=1), jnp.sum(few, axis=0), many.sum(axis=0)])
+
+
 def loops(x):
     after = jax.lax.fori_loop(0, 3, lambda k, y: y * x + jnp.roll(y, 1), x)
     sums = jax.lax.scan(lambda c, y: (c + y, c * y), 1.0, x)[1]
@@ -52,7 +59,16 @@ def nothing(x):
     return jnp.ones(2)
 
 
-FUNCTIONS = [arithmetic, moves, lines_up, products, loops, others, nothing]
+FUNCTIONS = [
+    arithmetic,
+    moves,
+    lines_up,
+    products,
+    large_sums,
+    loops,
+    others,
+    nothing,
+]
 
 
 @pytest.mark.parametrize("fn", FUNCTIONS)

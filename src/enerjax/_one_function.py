@@ -29,7 +29,7 @@ _KNOWS_MARKS = (0, 10, 2) <= jaxlib.version.__version_info__ < (0, 11)
 _MARKS = {"xla_cpu_small_call": "true", "inlineable": "false"}
 
 # Entries of what is summed, above which XLA calls a library; here with room to spare.
-_FEW = 2048
+LARGEST_SUM = 2048
 # Rows or columns from which it does for products of matrices.
 _THIN = 8
 
@@ -175,7 +175,7 @@ def _is_possible(jaxpr: Jaxpr) -> bool:
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
         if name in _POSSIBLE_IF_SMALL:
-            possible = all(x.aval.size <= _FEW for x in eqn.invars)  # pyright: ignore
+            possible = all(x.aval.size <= LARGEST_SUM for x in eqn.invars)  # pyright: ignore
         elif name == "dot_general":
             possible = _is_small_product(eqn)
         else:
@@ -193,7 +193,7 @@ def _is_small_product(eqn: Any) -> bool:
         [n for k, n in enumerate(shape) if k not in (*used, *of_batch)]
         for shape, used, of_batch in zip(sizes, contracted, batch, strict=True)
     )
-    if max(x.aval.size for x in eqn.invars) > _FEW:
+    if max(x.aval.size for x in eqn.invars) > LARGEST_SUM:
         return False
     is_thin = max((*sizes[0], *sizes[1]), default=1) < _THIN
     return is_thin or not left or not right

@@ -14,6 +14,7 @@ from .blocks import (
 from .dense import (
     AbstractFactors as AbstractFactors,
     inverse as inverse,
+    product as product,
     solve as solve,
 )
 from .given import KLU as KLU

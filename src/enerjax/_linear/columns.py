@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from .._one_function import LARGEST_SUM
 from .._tracing import evaluate, interpret
 
 
@@ -33,6 +34,10 @@ def jacobian_columns(
 ) -> Float[Array, "m n"]:
     """The Jacobian of `fn` at `x`."""
     return columns_along(fn, x, jnp.eye(x.size, dtype=x.dtype))
+
+
+# Parts in which a large sum is taken.
+_PARTS = 8
 
 
 class _Columns:
@@ -69,7 +74,12 @@ def _transposed(x, k, *, permutation):
 
 
 def _summed(x, k, *, axes, **_):
-    return jnp.sum(x, axis=axes)
+    # In parts that are small enough for one function.
+    count = max(-(-x.size // LARGEST_SUM), 1)
+    if count > min(k, _PARTS):
+        return jnp.sum(x, axis=axes)
+    parts = (jnp.sum(part, axis=axes) for part in jnp.array_split(x, count, axis=-1))
+    return jnp.concatenate([*parts], axis=-1)
 
 
 def _split(x, k, *, sizes, axis):

@@ -35,9 +35,7 @@ def _inverse_jvp(primals, tangents):
     # Matrix products alone, however often it is differentiated.
     (x,), (dx,) = primals, tangents
     y = inverse(x)
-    if x.shape[0] > SMALL:
-        return y, -y @ dx @ y
-    return y, -_product(_product(y, dx), y)
+    return y, -product(product(y, dx), y)
 
 
 @jax.jit
@@ -117,7 +115,7 @@ class Inverse(AbstractFactors):
         def improved(x, e, size):
             """The next inverse, its error `e^3` in factors, and a bound on its size."""
             square, both, part = unmerged(_square)(e)
-            return x + _product(x, both), (e, square), size * part
+            return x + product(x, both), (e, square), size * part
 
         def is_rough(carry) -> Flag:
             _, _, size = carry
@@ -125,7 +123,7 @@ class Inverse(AbstractFactors):
 
         def turn(carry):
             x, error, size = carry
-            return improved(x, _product(*error), size)
+            return improved(x, product(*error), size)
 
         def is_lost(carry) -> Flag:
             _, _, size = carry
@@ -181,8 +179,10 @@ _FAR = 0.5
 _ENOUGH = 1e-7
 
 
-def _product(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n m"]:
-    """A matrix product that XLA fuses with its surroundings, unlike `a @ b`."""
+def product(a: Float[Array, "n k"], b: Any) -> Float[Array, "n m"]:
+    """`a @ b`, which XLA fuses with its surroundings where both are small arrays."""
+    if a.shape[1] > SMALL or not isinstance(b, jax.Array):
+        return a @ b
     # Row by row of `b`: the inner loop is over neighbours, and is vectorised.
     terms = [a[:, k, None] * b[None, k] for k in range(a.shape[1])]
     return functools.reduce(jnp.add, terms) if terms else a @ b
@@ -191,13 +191,13 @@ def _product(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n 
 def _defect(matrix: Array, inverse: Array) -> tuple[Array, Scalar]:
     """What an inverse leaves of the identity, and the size of that."""
     identity = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
-    defect = identity - _product(matrix, inverse)
+    defect = identity - product(matrix, inverse)
     return defect, _row_sum(defect)
 
 
 def _square(e: Float[Array, "n n"]) -> tuple[Array, Array, Scalar]:
     """`e^2`, `e + e^2` and the size of the first."""
-    square = _product(e, e)
+    square = product(e, e)
     return square, e + square, _row_sum(square)
 
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._linear import affine_root, solve
+from .._linear import affine_root, product, solve
 from .._system import State
 from .._types import Coordinates, JointMultipliers, Multipliers, Velocities
 from .interval import lapse_of
@@ -57,7 +57,7 @@ def multipliers(model: "SeparableModel", state: State) -> Multipliers:
     rows = rows / model.scales.constraint[:, None]
     push = inverse_inertia @ model.slope(state)
     right = _drift(model, state, state.v) / model.scales.constraint - rows @ push
-    mobility = rows @ inverse_inertia @ rows.T
+    mobility = product(product(rows, inverse_inertia), rows.T)
     return solve(mobility, right) / model.scales.constraint
 
 

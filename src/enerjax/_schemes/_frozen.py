@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._linear import as_dense, Assembled, inverse, Symmetric
+from .._linear import as_dense, Assembled, inverse, product, Symmetric
 from .._model import SeparableModel
 from .._system import State
 from .._types import Scalar
@@ -45,7 +45,7 @@ def freeze(step: StepProblem, alpha: Scalar) -> Frozen:
     if isinstance(stiffness, Assembled):
         return Frozen(step, stiffness, inertia, none, none, none)
     inertia = as_dense(inertia)
-    jump = inverse(inertia + lag**2 * stiffness) @ (h / 6 * stiffness)
+    jump = product(inverse(inertia + lag**2 * stiffness), h / 6 * stiffness)
     if isinstance(model, SeparableModel):
         damping = inverse(jnp.eye(start.q.size, dtype=h.dtype) + lag * jump)
         return Frozen(step, stiffness, inertia, none, jump, damping)

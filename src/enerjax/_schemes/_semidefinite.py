@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._linear import as_dense, Assembled, cholesky, eigh, inverse, Symmetric
+from .._linear import as_dense, Assembled, cholesky, eigh, inverse, product, Symmetric
 
 
 def semidefinite_part(
@@ -27,14 +27,15 @@ def _dense_part(
 ) -> Float[Array, "nq nq"]:
     root = cholesky(inertia)
     back = inverse(root)
-    whole = back @ stiffness @ back.T
-    return root @ _positive_part(0.5 * (whole + whole.T)) @ root.T
+    whole = product(product(back, stiffness), back.T)
+    part = _positive_part(0.5 * (whole + whole.T))
+    return product(product(root, part), root.T)
 
 
 @jax.custom_jvp
 def _positive_part(x: Float[Array, "n n"]) -> Float[Array, "n n"]:
     values, vectors = eigh(x)
-    return (vectors * jnp.maximum(values, 0)[None, :]) @ vectors.T
+    return product(vectors * jnp.maximum(values, 0)[None, :], vectors.T)
 
 
 @_positive_part.defjvp
@@ -48,6 +49,6 @@ def _positive_part_jvp(primals, tangents):
     mixed = (rows > 0) != (columns > 0)
     quotient = (positive[:, None] - positive[None, :]) / jnp.where(mixed, rows - columns, 1)
     factor = jnp.where(mixed, quotient, (rows > 0).astype(x.dtype))
-    inner = factor * (vectors.T @ dx @ vectors)
-    value = (vectors * positive[None, :]) @ vectors.T
-    return value, vectors @ inner @ vectors.T
+    inner = factor * product(product(vectors.T, dx), vectors)
+    value = product(vectors * positive[None, :], vectors.T)
+    return value, product(product(vectors, inner), vectors.T)
