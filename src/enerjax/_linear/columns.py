@@ -23,10 +23,7 @@ def columns_along(
     """The derivatives of `fn` at `x` along the columns of `seeds`."""
     program = jax.make_jaxpr(lambda seed: jax.jvp(fn, (x,), (seed,))[1])(x)
     (out,) = interpret(program.jaxpr, program.consts, [_Columns(seeds)], _equation)
-    if isinstance(out, _Columns):
-        return out.array
-    # Nothing depends on `x`.
-    return jnp.broadcast_to(out[..., None], (*out.shape, seeds.shape[1]))
+    return _in_columns(out, seeds.shape[1])
 
 
 def jacobian_columns(
@@ -36,10 +33,6 @@ def jacobian_columns(
     return columns_along(fn, x, jnp.eye(x.size, dtype=x.dtype))
 
 
-# Parts in which a large sum is taken.
-_PARTS = 8
-
-
 class _Columns:
     """An array with an axis more, the last one, in which its columns follow each other."""
 
@@ -47,6 +40,15 @@ class _Columns:
         self.array = array
 
 
+def _in_columns(value: "Array | _Columns", k: int) -> Array:
+    """With that axis, also where the value does not depend on the seeds."""
+    if isinstance(value, _Columns):
+        return value.array
+    return jnp.broadcast_to(value[..., None], (*value.shape, k))
+
+
+# Parts in which a large sum is taken.
+_PARTS = 8
 # What is left of arithmetic in a tangent.
 _ELEMENTWISE = frozenset("add add_any convert_element_type copy div mul neg sub".split())
 
@@ -108,19 +110,14 @@ def _equation(equation: Any, values: list[Any]) -> list[Any]:
         inner = params["jaxpr"]
         return interpret(inner.jaxpr, inner.consts, values, _equation)
     if name in _ELEMENTWISE:
-        arrays = [x.array if isinstance(x, _Columns) else x[..., None] for x in values]
+        arrays = [_in_columns(x, k) for x in values]
         shape = jnp.broadcast_shapes(*(x.shape for x in arrays))
         out = evaluate(primitive, [jnp.broadcast_to(x, shape) for x in arrays], params)
     elif name in _MOVES and len(values) == 1:
         out = _MOVES[name](values[0].array, k, **params)
         out = out if primitive.multiple_results else [out]
     elif name == "concatenate":
-        arrays = [
-            x.array
-            if isinstance(x, _Columns)
-            else jnp.broadcast_to(x[..., None], (*x.shape, k))
-            for x in values
-        ]
+        arrays = [_in_columns(x, k) for x in values]
         out = [lax.concatenate(arrays, params["dimension"])]
     elif name == "pad" and not isinstance(values[1], _Columns):
         config = (*params["padding_config"], (0, 0, 0))

@@ -117,6 +117,7 @@ class Linearisable(eqx.Module):
             product,
             right,
             lambda _, right: factors.solve(right),
+            # (`linear_transpose` has no rule for what is one function.)
             lambda _, right: jax.vjp(factors.solve, right)[1](right)[0],
         )
 
