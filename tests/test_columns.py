@@ -55,6 +55,24 @@ def others(x):
     return jnp.concatenate([matrix[0], top, jnp.sort(-x), jax.nn.relu(x - 0.5)])
 
 
+@jax.custom_jvp
+def asks(x):
+    return x**2
+
+
+@asks.defjvp
+def _asks_jvp(primals, tangents):
+    (x,), (t,) = primals, tangents
+    return asks(x), jnp.where(t == 0, 0, 2 * x * t) + jnp.where(t != 0, 0, t)
+
+
+def parts(x):
+    """Of the unknowns in groups, which come together later."""
+    first, second, third = x[:2], x[2:3], x[3:]
+    y = jnp.sin(third) * jnp.outer(first, third).sum(axis=0)
+    return jnp.concatenate([y, asks(first), asks(x[1:]), second * first, first[::-1]])
+
+
 def nothing(x):
     return jnp.ones(2)
 
@@ -67,6 +85,7 @@ FUNCTIONS = [
     large_sums,
     loops,
     others,
+    parts,
     nothing,
 ]
 
@@ -90,7 +109,16 @@ def test_columns_are_those_of_the_jacobian(fn):
 def test_columns_along_seeds():
     """Of a function whose values have axes of their own."""
     fn = lambda x: jnp.sin(x.reshape(2, 3)) * x[0]
-    seeds = jnp.cos(jnp.arange(24.0).reshape(6, 4))
+    seeds = np.cos(np.arange(24.0).reshape(6, 4))
     ours = columns_along(fn, X, seeds)
     assert ours.shape == (2, 3, 4)
     np.testing.assert_allclose(ours, jax.jacfwd(fn)(X) @ seeds, rtol=0, atol=1e-14)
+
+
+def test_columns_that_are_zero_are_not_computed():
+    """Of values that depend on two of the six unknowns."""
+    fn = lambda x: jnp.append(jnp.sin(jnp.sin(x[2:4])), x[4:] * x[:2])
+    program = jax.make_jaxpr(lambda x: jacobian_columns(fn, x))(X)
+    products = [e for e in program.jaxpr.eqns if e.primitive.name == "mul"]
+    assert {e.outvars[0].aval.shape for e in products} <= {(2,), (2, 2)}
+    assert len(products) >= 4

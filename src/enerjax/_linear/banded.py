@@ -84,9 +84,8 @@ def coloured_products(
     fn: Callable[[Array], Array], x: Float[Array, " n"], colours: np.ndarray
 ) -> Float[Array, "m ... colours"]:
     """For each colour the sum of the columns that have it."""
-    numbers = jnp.arange(int(colours.max(initial=0)) + 1)
-    seeds = (jnp.asarray(colours)[:, None] == numbers[None, :]).astype(x.dtype)
-    return columns_along(fn, x, seeds)
+    numbers = np.arange(int(colours.max(initial=0)) + 1)
+    return columns_along(fn, x, colours[:, None] == numbers)
 
 
 def column_colours(pattern: csr_array, order: np.ndarray) -> np.ndarray:
