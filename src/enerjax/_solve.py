@@ -116,6 +116,12 @@ def solve(
         z = jax.tree.map(jnp.multiply, x, unknown_scale)
         return jax.tree.map(jnp.divide, scheme.residual(z, problem), row_scale)
 
+    def simplified(x, held, inputs):
+        scheme, problem, unknown_scale, row_scale = inputs
+        z, held = (jax.tree.map(jnp.multiply, x, unknown_scale) for x in (x, held))
+        rows = scheme.simplified(z, held, problem)
+        return jax.tree.map(jnp.divide, rows, row_scale)
+
     inputs = (scheme, problem, unknown_scale, row_scale)
 
     # Smooth motion is met by extrapolation; where it changes quickly the last step is
@@ -136,6 +142,7 @@ def solve(
         second_guess=jax.tree.map(jnp.divide, flight, unknown_scale),
         fill=_fill(model, unknown_scale, row_scale),
         least=least,
+        simplified=simplified,
     )
     root = find(guess=guess, factors=memory.factors, skip=skip)
     if model.system.redundant:

@@ -204,6 +204,15 @@ class AbstractSingleSolve(AbstractScheme, Generic[Z, P]):
     def residual(self, z: Z, problem: P) -> Z:
         """The step equations; zero at the solution."""
 
+    def simplified(self, z: Z, held: Z, problem: P) -> Z:
+        """The step equations with weak couplings left at `held`; the same where that is `z`.
+
+        Their Jacobian at `held` takes the place of the exact one in the search for the
+        solution of a large system: fewer unknowns meet in a row.
+        """
+        del held
+        return self.residual(z, problem)
+
     @abc.abstractmethod
     def finish(self, z: Z, problem: P) -> StepEnd:
         """The end of the step from the solved unknowns."""

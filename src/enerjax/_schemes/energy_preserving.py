@@ -64,13 +64,27 @@ class EnergyPreserving(AbstractSingleSolve[Increment, StepProblem]):
         return problem.guess(acceleration, multipliers)
 
     def residual(self, z: Increment, problem: StepProblem) -> Increment:
-        end = self._end(z, problem)
-        drive = problem.drive(problem.start, end, z)
+        end = self._end(z, problem, z)
+        return self._rows(z, problem, end, end)
+
+    def simplified(self, z: Increment, held: Increment, problem: StepProblem) -> Increment:
+        if not isinstance(problem.model, SeparableModel):
+            return self.residual(z, problem)
+        impulses = eqx.tree_at(
+            lambda z: z.velocity_impulse, z, held.velocity_impulse
+        )
+        end, mean = self._end(z, problem, held), self._end(impulses, problem, held)
+        return self._rows(z, problem, end, mean)
+
+    def _rows(
+        self, z: Increment, problem: StepProblem, end: State, pushed: State
+    ) -> Increment:
+        drive = problem.drive(problem.start, pushed, z)
         load = problem.step_load(end, z)
         return problem.rows(z, end, drive.less(load))  # eq. (14a, c)
 
     def finish(self, z: Increment, problem: StepProblem) -> StepEnd:
-        end = self._end(z, problem)
+        end = self._end(z, problem, z)
         drive_work = problem.drive_work(problem.start, end, z)
         nothing = jnp.zeros_like(problem.h)
         return StepEnd(
@@ -82,12 +96,14 @@ class EnergyPreserving(AbstractSingleSolve[Increment, StepProblem]):
             RESULTS.successful,
         )
 
-    def _end(self, z: Increment, problem: StepProblem) -> State:
+    def _end(self, z: Increment, problem: StepProblem, held: Increment) -> State:
+        """The end of the step, with the gradients in its reaction those at `held`."""
         model, start = problem.model, problem.start
         if not isinstance(model, SeparableModel):
             return problem.node(z, problem.end_time)
         q1, t1 = problem.at(z), problem.end_time
         # eq. (14b), solved for the velocity
         mean = problem.velocity(z)
-        mean = mean - model.mean_reaction(start.q, start.t, q1, t1, z.velocity_impulse)
+        q_held = q1 if held is z else problem.at(held)
+        mean = mean - model.mean_reaction(start.q, start.t, q_held, t1, z.velocity_impulse)
         return State(q1, 2 * mean - start.v, t1)
