@@ -37,6 +37,8 @@ class Newton(eqx.Module):
       given the dense Jacobian, or `KLU()` where it is large and sparse. Without it size
       and structure decide: plain operations up to 32 unknowns, LAPACK, and above 64 the
       narrow band that the pattern of the equations can be numbered into, if there is one.
+      A scheme can name weak couplings without which the band is narrower: the search then
+      does without them, and begins again with them where it fails. Derivatives are exact.
 
     A `linear_solver` of another type raises a `TypeError`.
     """

@@ -199,7 +199,7 @@ def _substituted(
     def forward(left, item):
         turn, order, rows = item
         rows = jnp.concatenate([left, rows])[order]
-        turned = turn @ rows[:width]
+        turned = _times(turn, rows[:width])
         return rows[width:] + turned[width:], turned[:width]
 
     following = jnp.concatenate([right[1:], none[None]])
@@ -207,8 +207,15 @@ def _substituted(
 
     def backward(after, item):
         rows, value = item
-        x = value - rows @ after
+        x = value - _times(rows, after)
         return jnp.concatenate([x, after[:width]]), x
 
     after = jnp.concatenate([none, none])
     return jax.lax.scan(backward, after, (upper, solved), reverse=True)[1]
+
+
+def _times(matrix: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"]:
+    if matrix.shape[1] >= 2 * LIBRARY:
+        return matrix @ x
+    # Rows side by side, by vector instructions.
+    return jnp.sum(matrix * x[None], axis=1)
