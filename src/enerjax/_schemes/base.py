@@ -209,17 +209,20 @@ class AbstractSingleSolve(AbstractScheme, Generic[Z, P]):
     def residual(self, z: Z, problem: P) -> Z:
         """The step equations; zero at the solution."""
 
-    def simplified(self, z: Z, held: Z, problem: P) -> Z:
-        """The same where `held` is `z`; weak couplings between neighbours stay at `held`.
-
-        A large system is searched with the Jacobian of this: fewer unknowns meet in a row.
-        """
-        del held
-        return self.residual(z, problem)
-
     @abc.abstractmethod
     def finish(self, z: Z, problem: P) -> StepEnd:
         """The end of the step from the solved unknowns."""
+
+
+class AbstractSimplifiedSolve(AbstractSingleSolve[Z, P], Generic[Z, P]):
+    """A scheme with weak couplings between neighbours, which a search can do without."""
+
+    @abc.abstractmethod
+    def simplified(self, z: Z, held: Z, problem: P) -> Z:
+        """The residual where `held` is `z`; weak couplings stay at `held`.
+
+        A large system is searched with the Jacobian of this: fewer unknowns meet in a row.
+        """
 
 
 class AbstractCarryingSolve(AbstractSingleSolve[Z, P], Generic[Z, P]):

@@ -18,14 +18,14 @@ from ._decaying import (
     split_velocities,
 )
 from .base import (
-    AbstractSingleSolve,
+    AbstractSimplifiedSolve,
     Formulation,
     StepEnd,
     StepProblem,
 )
 
 
-class EnergyDecaying(AbstractSingleSolve[JumpAndEnd, StepProblem]):
+class EnergyDecaying(AbstractSimplifiedSolve[JumpAndEnd, StepProblem]):
     """Discontinuous Galerkin scheme: the energy decays by `alpha` times a jump.
 
     The state jumps from `z0` to `zj` at the start of the step and moves on to `z1`:

@@ -8,14 +8,14 @@ from .._system import State
 from .._types import Multipliers, Scalar, Velocities
 from ._checks import check_derivative, check_formulation
 from .base import (
-    AbstractSingleSolve,
+    AbstractSimplifiedSolve,
     Formulation,
     StepEnd,
     StepProblem,
 )
 
 
-class EnergyPreserving(AbstractSingleSolve[Increment, StepProblem]):
+class EnergyPreserving(AbstractSimplifiedSolve[Increment, StepProblem]):
     """Continuous Galerkin scheme: keeps the total energy, damps nothing.
 
     Solves `S(z0, z1, DH(z0, z1)) = 0` with the constraints at the end of the step.
