@@ -37,6 +37,8 @@ class Newton(eqx.Module):
       given the dense Jacobian, or `KLU()` where it is large and sparse. Without it size
       and structure decide: plain operations up to 32 unknowns, LAPACK, and above 64 the
       narrow band that the pattern of the equations can be numbered into, if there is one.
+      A scheme can name weak couplings without which the band is narrower: the search then
+      does without them, and begins again with them where it fails. Derivatives are exact.
 
     A `linear_solver` of another type raises a `TypeError`.
     """
@@ -97,7 +99,7 @@ class _Iterate(eqx.Module):
 
 # Jacobians after which a first guess is given up. Where quadratic convergence sets in at
 # all, it does so before.
-_PATIENCE = 12
+PATIENCE = 12
 # What a correction may leave of the one before, for its Jacobian to serve on. That of the
 # step before is not used: it leaves an error of round-off size, but of one sign, and the
 # energy would drift.
@@ -162,8 +164,8 @@ def newton_iterations(
         back = first & ~less & ~done & (before.part > _LEAST_PART)
         part = jnp.where(back, 0.5 * before.part, jnp.ones_like(before.part))
         broken = fresh & ~jnp.isfinite(size)
-        lost = broken | (~kept & ~back & (before.jacobians == _PATIENCE))
-        again = lost & ~done & (before.jacobians <= _PATIENCE)
+        lost = broken | (~kept & ~back & (before.jacobians == PATIENCE))
+        again = lost & ~done & (before.jacobians <= PATIENCE)
         stays = jnp.where(back, before.x + part * before.step, before.x)
         return _Iterate(
             jnp.where(again, second, jnp.where(kept, x, stays)),
@@ -173,7 +175,7 @@ def newton_iterations(
             jnp.where(again, jnp.inf, jnp.where(kept, size, before.size)),
             jnp.where(fresh | again | back, 0, contraction),
             before.corrections + (kept | back).astype(before.corrections.dtype),
-            jnp.where(again, _PATIENCE + 1, before.jacobians),
+            jnp.where(again, PATIENCE + 1, before.jacobians),
             stalls,
             defect,
             jnp.zeros_like(fresh),

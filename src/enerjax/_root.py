@@ -16,8 +16,15 @@ from jax.ad_checkpoint import checkpoint_name
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from ._linear import AbstractFactors, kept_factors, linearisable
-from ._newton import max_norm, Newton, newton_iterations, Start
+from ._linear import (
+    AbstractFactors,
+    kept_factors,
+    LARGE,
+    Linearisable,
+    linearisable,
+    narrowed,
+)
+from ._newton import max_norm, Newton, newton_iterations, PATIENCE, Start
 from ._one_function import in_one_function
 from ._tracing import is_known
 from ._types import Count, Flag, Scalar
@@ -61,6 +68,7 @@ def _flat(fill: PyTree[Array] | None) -> Array | None:
 
 def _search(
     fn: Callable[[PyTree[Array], Any], PyTree[Array]],
+    simplified: Callable[[PyTree[Array], PyTree[Array], Any], PyTree[Array]] | None,
     root_finder: RootFinder,
     args: PyTree,
     start: Start,
@@ -89,8 +97,31 @@ def _search(
         )
     flat, unravel, flat_fn = _flattened(fn, start.guess)
     given, fill = root_finder.linear_solver, _flat(start.fill)
-    residual = linearisable(flat_fn, flat, args, given, fill)
-    last = newton_iterations(residual, root_finder, start, max_iterations)
+    exact, near = linearisable(flat_fn, flat, args, given, fill), None
+    if simplified is not None and given is None:
+        flat_simplified = lambda x, inputs: ravel_pytree(
+            simplified(unravel(x), unravel(inputs[0]), inputs[1])
+        )[0]
+        near = narrowed(exact, flat_simplified, flat, args)
+    if near is None:
+        return _iterated(exact, root_finder, start, max_iterations)
+    first = _iterated(near, root_finder, start, PATIENCE)
+
+    def again() -> Root:
+        # (The lanes of a batch all come here.)
+        left = eqx.tree_at(lambda start: start.skip, start, start.skip | first.found)
+        last = _iterated(exact, root_finder, left, max_iterations)
+        made = first.iterations + last.iterations
+        return eqx.tree_at(lambda root: root.iterations, last, made)
+
+    return jax.lax.cond(first.found, lambda: first, again)
+
+
+def _iterated(
+    residual: Linearisable, newton: Newton, start: Start, max_jacobians: int
+) -> Root:
+    _, unravel = ravel_pytree(start.guess)
+    last = newton_iterations(residual, newton, start, max_jacobians)
     keeps = residual.keeps_factors and start.factors is not None
     factors = last.factors if keeps else start.factors
     return Root(
@@ -105,16 +136,16 @@ def _search(
 
 
 @eqx.filter_custom_jvp
-def _root(fn, root_finder, args, start, max_iterations):
-    return _search(fn, root_finder, args, start, max_iterations)
+def _root(fn, simplified, root_finder, args, start, max_iterations):
+    return _search(fn, simplified, root_finder, args, start, max_iterations)
 
 
 @_root.def_jvp
 def _root_jvp(primals, tangents):
-    fn, root_finder, args, start, max_iterations = primals
-    t_args = tangents[2]
+    fn, simplified, root_finder, args, start, max_iterations = primals
+    t_args = tangents[3]
     # Where derivatives are taken the loop around is no longer one function.
-    search = lambda: _root(fn, root_finder, args, start, max_iterations)
+    search = lambda: _root(fn, simplified, root_finder, args, start, max_iterations)
     root = in_one_function(search)()
     # All that the derivatives of a step need of the search for it.
     root = eqx.tree_at(
@@ -148,6 +179,7 @@ def find_root(
     skip: Flag | bool = False,
     fill: PyTree[Array] | None = None,
     least: Scalar | float = 1.0,
+    simplified: Callable[[PyTree[Array], PyTree[Array], Any], PyTree[Array]] | None = None,
 ) -> Root:
     """The root of `fn(y, args)`. Never raises.
 
@@ -161,6 +193,10 @@ def find_root(
     Jacobian, and make it regular. Such unknowns then stay what they are in the guess.
     Unknowns that turn out all smaller than one are resolved by their own size, down to
     `least`.
+
+    `simplified(y, held, args)` equals `fn` where `held` is `y`. Where its Jacobian in `y`
+    is a narrower band, `Newton` searches with that, and with the exact one only where that
+    search has failed.
     """
     flat, _ = ravel_pytree(guess)
     start = Start(
@@ -172,11 +208,22 @@ def find_root(
         jnp.asarray(least, flat.dtype),
     )
     start = jax.lax.stop_gradient(start)
-    # What is closed over becomes an input: functions in `args` may hold traced numbers.
-    # (The lambda has a closure, without which the conversion would not look for any.)
-    closed = lambda y, args: fn(y, args)
-    converted = eqx.filter_closure_convert(closed, guess, args)
+    traced, opened = _opened(fn, guess, args)
+    call = lambda y, inputs: opened(inputs[0], y, inputs[1])
+    near, others = None, None
+    if simplified is not None and flat.size > LARGE:
+        others, opened_too = _opened(simplified, guess, guess, args)
+        near = lambda y, held, inputs: opened_too(inputs[2], y, held, inputs[1])
+    inputs = traced, args, others
+    return _root(call, near, root_finder, inputs, start, max_iterations)
+
+
+def _opened(fn: Callable, *like: Any) -> tuple[Any, Callable]:
+    """What is traced of that which `fn` closes over, and `fn` as a function of it too."""
+    # Functions in `args` may hold traced numbers. (The lambda has a closure, without which
+    # the conversion would not look for any.)
+    closed = lambda *args: fn(*args)
+    converted = eqx.filter_closure_convert(closed, *like)
     # What is known stays closed over: indices tell which unknowns a row depends on.
     traced, known = eqx.partition(converted, lambda x: not is_known(x))
-    call = lambda y, inputs: eqx.combine(inputs[0], known)(y, inputs[1])
-    return _root(call, root_finder, (traced, args), start, max_iterations)
+    return traced, lambda traced, *args: eqx.combine(traced, known)(*args)

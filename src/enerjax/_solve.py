@@ -19,7 +19,12 @@ from ._newton import max_norm
 from ._results import first_failure, from_root_finder, RESULTS
 from ._root import find_root, RootFinder
 from ._scaling import scales_like
-from ._schemes import AbstractCarryingSolve, AbstractSingleSolve, StepEnd
+from ._schemes import (
+    AbstractCarryingSolve,
+    AbstractSimplifiedSolve,
+    AbstractSingleSolve,
+    StepEnd,
+)
 from ._system import State
 from ._types import Count, Flag, Multipliers, Scalar, Velocities
 
@@ -116,6 +121,13 @@ def solve(
         z = jax.tree.map(jnp.multiply, x, unknown_scale)
         return jax.tree.map(jnp.divide, scheme.residual(z, problem), row_scale)
 
+    def simplified(x, held, inputs):
+        scheme, problem, unknown_scale, row_scale = inputs
+        assert isinstance(scheme, AbstractSimplifiedSolve)
+        z, held = (jax.tree.map(jnp.multiply, x, unknown_scale) for x in (x, held))
+        rows = scheme.simplified(z, held, problem)
+        return jax.tree.map(jnp.divide, rows, row_scale)
+
     inputs = (scheme, problem, unknown_scale, row_scale)
 
     # Smooth motion is met by extrapolation; where it changes quickly the last step is
@@ -136,6 +148,7 @@ def solve(
         second_guess=jax.tree.map(jnp.divide, flight, unknown_scale),
         fill=_fill(model, unknown_scale, row_scale),
         least=least,
+        simplified=simplified if isinstance(scheme, AbstractSimplifiedSolve) else None,
     )
     root = find(guess=guess, factors=memory.factors, skip=skip)
     if model.system.redundant:

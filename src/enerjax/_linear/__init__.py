@@ -24,6 +24,7 @@ from .jacobian import (
     kept_factors as kept_factors,
     Linearisable as Linearisable,
     linearisable as linearisable,
+    narrowed as narrowed,
     RowPattern as RowPattern,
 )
 from .norms import largest as largest

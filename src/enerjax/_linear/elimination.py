@@ -1,62 +1,78 @@
 """One step of a block elimination: some columns of a few rows."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
+
+from .dense import product
 
 
 # Columns from which LAPACK is faster than plain operations.
 LIBRARY = 16
+# Columns up to which the elimination is written out: it compiles slowly.
+_UNROLLED = 8
 
 
-def pivot_rows_first(rows: Float[Array, "m w"], count: int) -> tuple[Array, Array]:
-    """Rows reduced so that their first `count` columns are those of the identity.
+def pivot_rows_first(
+    panel: Float[Array, "m w"],
+) -> tuple[Float[Array, "m w"], Int[Array, " m"]]:
+    """What reduces the first columns of some rows to those of the identity.
 
-    With row pivoting: the rows that were pivots come first. Returns the columns behind,
-    `(m, w - count)`, and the matrix `(m, m)` that takes the rows there.
+    With row pivoting: the order of the rows, those that were pivots first, and the matrix
+    by which these, in that order, are solved for the `w` unknowns and taken off the rest;
+    see `reduced`.
     """
-    return _by_library(rows, count) if count >= LIBRARY else _by_hand(rows, count)
+    return _by_library(panel) if panel.shape[1] >= LIBRARY else _by_hand(panel)
 
 
-def _by_library(rows: Float[Array, "m w"], count: int) -> tuple[Array, Array]:
-    """`P rows = [L1; L2] U` in the first columns: `(L1 U)^-1`, and less `L2 L1^-1`."""
-    panel, _, order = jax.lax.linalg.lu(rows[:, :count])
-    eye = jnp.eye(rows.shape[0], dtype=rows.dtype)
+def reduced(
+    turn: Float[Array, "m w"], order: Int[Array, " m"], rows: Float[Array, "m k"]
+) -> tuple[Float[Array, "w k"], Float[Array, "rest k"]]:
+    """The other columns of the rows: of the pivots, and of what is left."""
+    count = turn.shape[1]
+    rows = rows[order]
+    pivots = rows[:count]
+    turned = turn @ pivots if count >= LIBRARY else product(turn, pivots)
+    return turned[:count], rows[count:] + turned[count:]
+
+
+def _by_library(panel: Float[Array, "m w"]) -> tuple[Array, Array]:
+    """`P rows = [L1; L2] U`: `(L1 U)^-1`, and less `L2 L1^-1`."""
+    count = panel.shape[1]
+    panel, _, order = jax.lax.linalg.lu(panel)
     own, below = panel[:count], panel[count:]
     solve = jax.lax.linalg.triangular_solve
-    inverse = solve(
-        own, eye[:count, :count], left_side=True, lower=True, unit_diagonal=True
-    )
-    first, rest = solve(own, inverse, left_side=True), -below @ inverse
-    behind = rows[order, count:]
-    turned = [first @ behind[:count], behind[count:] + rest @ behind[:count]]
-    turn = eye.at[:, :count].set(jnp.concatenate([first, rest]))
-    return jnp.concatenate(turned), turn[:, jnp.argsort(order)]
+    eye = jnp.eye(count, dtype=panel.dtype)
+    inverse = solve(own, eye, left_side=True, lower=True, unit_diagonal=True)
+    turn = jnp.concatenate([solve(own, inverse, left_side=True), -below @ inverse])
+    return turn, order.astype(jnp.arange(1).dtype)
 
 
-def _by_hand(rows: Float[Array, "m w"], count: int) -> tuple[Array, Array]:
-    """By Gauss and Jordan, without a call that would break up the loop around."""
-    num_rows, num_columns = rows.shape
-    whole = jnp.concatenate([rows, jnp.eye(num_rows, dtype=rows.dtype)], axis=1)
-    numbers, counted = jnp.arange(num_rows), jnp.arange(count)
+def _by_hand(panel: Float[Array, "m w"]) -> tuple[Array, Array]:
+    """By Gauss and Jordan in place, without a call that would break up the loop around."""
+    num_rows, count = panel.shape
+    numbers = jnp.arange(num_rows)
 
     def column(k, carry):
-        whole, free, places = carry
-        entries = whole[:, k]
-        pivot = jnp.argmax(jnp.where(free, jnp.abs(entries), -1))
-        chosen = numbers == pivot
-        row = whole[pivot] / entries[pivot]
-        factors = jnp.where(chosen, 0, entries)
-        whole = jnp.where(chosen[:, None], row[None], whole - factors[:, None] * row[None])
-        return whole, free & ~chosen, jnp.where(counted == k, pivot, places)
+        panel, order = carry
+        sizes = jnp.where(numbers >= k, jnp.abs(panel[:, 0]), -1)
+        # The first of the largest: cheaper as two plain reductions than `argmax`. (Where
+        # an entry is not a number there is none, and all becomes so.)
+        pivot = jnp.min(jnp.where(sizes == jnp.max(sizes), numbers, num_rows - 1))
+        exchanged = jnp.where(numbers == pivot, k, numbers)
+        exchanged = jnp.where(numbers == k, pivot, exchanged)
+        panel, order = panel[exchanged], order[exchanged]
+        is_pivot = numbers == k
+        # The column is done; that of the right-hand side takes its place, as the last.
+        row = jnp.append(panel[k, 1:], 1) / panel[k, 0]
+        factors = jnp.where(is_pivot, -1, panel[:, 0])
+        rest = jnp.where(is_pivot[:, None], 0, panel[:, 1:])
+        rest = jnp.pad(rest, ((0, 0), (0, 1)))
+        return rest - factors[:, None] * row[None], order
 
-    carry = whole, jnp.ones((num_rows,), bool), jnp.zeros((count,), numbers.dtype)
-    whole, free, places = jax.lax.fori_loop(0, count, column, carry)
-    # What is left, in its order: the row of the first, second, ... that is free.
-    # (Counted plainly: `cumsum` is not possible in one function.)
-    before = free[None, :] & (numbers[None, :] <= numbers[:, None])
-    number_of = jnp.where(free, jnp.sum(before, axis=1), 0)
-    left = jnp.arange(1, num_rows - count + 1)
-    rest = jnp.argmax(number_of[None, :] == left[:, None], axis=1)
-    whole = whole[jnp.concatenate([places, rest])]
-    return whole[:, count:num_columns], whole[:, num_columns:]
+    carry = panel, numbers
+    if count <= _UNROLLED:
+        return functools.reduce(lambda carry, k: column(k, carry), range(count), carry)
+    return jax.lax.fori_loop(0, count, column, carry)

@@ -60,6 +60,9 @@ class Linearisable(eqx.Module):
     form: Full | Band | Scattered
     # Added to the diagonal of a Jacobian that may be singular.
     fill: Float[Array, " n"] | None
+    # For a point what stands for the function there, if only the corrections of a search
+    # are solved with its Jacobian.
+    near: Callable[[Array], Callable[[Array], Array]] | None = None
 
     @property
     def is_dense(self) -> bool:
@@ -74,9 +77,10 @@ class Linearisable(eqx.Module):
     def jacobian(self, x: Float[Array, " n"]) -> Array:
         """The Jacobian, in the form that `first_factors` are renewed with."""
         fill = self.fill
+        value = self.value if self.near is None else self.near(x)
         if fill is None:
-            return self.form.evaluate(self.value, x)
-        return self.form.evaluate(lambda x: self.value(x) + fill * x, x)
+            return self.form.evaluate(value, x)
+        return self.form.evaluate(lambda x: value(x) + fill * x, x)
 
     def first_factors(
         self, kept: AbstractFactors | None, x: Float[Array, " n"]
@@ -162,6 +166,28 @@ def affine_root(
     if linear.is_dense and fill is None:
         return -jnp.linalg.solve(linear.jacobian(at), linear.value(at))
     return -linear.solve(at, linear.value(at))
+
+
+def narrowed(
+    exact: Linearisable,
+    simplified: Callable[[Array, tuple[Array, PyTree]], Array],
+    like: Float[Array, " n"],
+    args: Any,
+) -> Linearisable | None:
+    """The same function with the Jacobian of `simplified(x, (x, args))` in the first `x`.
+
+    `None` where that is no narrower band: then nothing is gained.
+    """
+    fill, near = exact.fill, lambda held: plain_products(simplified, like, (held, args))
+    at = near(like)
+    pattern = jacobian_pattern(at if fill is None else lambda x: at(x) + fill * x, like)
+    if pattern is None:
+        return None
+    band, form = Band(pattern), exact.form
+    narrower = not isinstance(form, Band) or band.width < form.width
+    if not (band.worth_it() and narrower):
+        return None
+    return Linearisable(exact.value, band, fill, near)
 
 
 class RowPattern:

@@ -1,6 +1,7 @@
 from .base import (
     AbstractCarryingSolve as AbstractCarryingSolve,
     AbstractScheme as AbstractScheme,
+    AbstractSimplifiedSolve as AbstractSimplifiedSolve,
     AbstractSingleSolve as AbstractSingleSolve,
     StepEnd as StepEnd,
     StepProblem as StepProblem,

@@ -103,14 +103,19 @@ class StepProblem(eqx.Module):
             return jnp.zeros((0,), state.q.dtype)
         return self.model.joint_rate(state.q, state.v, state.t)
 
-    def rows(self, z: Increment, node: State, drive: Drive) -> Increment:
-        """The rows of one node: the structure residual, and the constraints held there."""
+    def rows(
+        self, z: Increment, node: State, drive: Drive, moving: State | None = None
+    ) -> Increment:
+        """The rows of one node: the structure residual, and the constraints held there.
+
+        (Their rates those of the node `moving`, if it is another.)
+        """
         structure = self.model.structure(self.start, node, self.h, z.rate, drive)
         return Increment(
             structure.impulse,
             structure.drift,
             self.model.constraint(node.q, node.t) / self.h,
-            self.joint_rate(node),
+            self.joint_rate(node if moving is None else moving),
         )
 
     def guess(self, acceleration: Velocities, multipliers: Multipliers) -> Increment:
@@ -209,6 +214,17 @@ class AbstractSingleSolve(AbstractScheme, Generic[Z, P]):
         """The end of the step from the solved unknowns."""
 
 
+class AbstractSimplifiedSolve(AbstractSingleSolve[Z, P], Generic[Z, P]):
+    """A scheme with weak couplings between neighbours, which a search can do without."""
+
+    @abc.abstractmethod
+    def simplified(self, z: Z, held: Z, problem: P) -> Z:
+        """The residual where `held` is `z`; weak couplings stay at `held`.
+
+        A large system is searched with the Jacobian of this: fewer unknowns meet in a row.
+        """
+
+
 class AbstractCarryingSolve(AbstractSingleSolve[Z, P], Generic[Z, P]):
     """A scheme that remembers more of the last step than the state at its end.
 
@@ -225,21 +241,3 @@ class AbstractCarryingSolve(AbstractSingleSolve[Z, P], Generic[Z, P]):
     @abc.abstractmethod
     def resume(self, problem: P, carried: PyTree[Any]) -> P:
         """The data of a step, with what the step before has handed on."""
-
-
-def check_formulation(scheme: str, formulation: str) -> None:
-    if formulation not in ("ggl", "index3"):
-        raise ValueError(
-            f'`{scheme}(formulation={formulation!r})`: use "ggl" (joints held at position '
-            'and velocity level) or "index3" (position level only).'
-        )
-
-
-def check_derivative(scheme: str, derivative: Any) -> None:
-    if not isinstance(derivative, AbstractDerivative):
-        missing = isinstance(derivative, type)
-        raise TypeError(
-            f"`{scheme}(derivative=...)` must be a discrete derivative such as "
-            f"`ChainRule()`, got {derivative!r}"
-            + (": the parentheses are missing." if missing else ".")
-        )

@@ -19,11 +19,11 @@ from .._results import RESULTS
 from .._system import State
 from .._tracing import is_known
 from .._types import Coordinates, Multipliers, Real, Scalar, Velocities
+from ._checks import check_derivative
 from ._decaying import alpha_from_spectral_radius, as_alpha, JumpAndEnd
 from ._frozen import freeze, Frozen
 from .base import (
     AbstractSingleSolve,
-    check_derivative,
     Formulation,
     StepEnd,
     StepProblem,

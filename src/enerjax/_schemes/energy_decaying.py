@@ -5,6 +5,7 @@ from .._model import AbstractModel, SeparableModel
 from .._results import RESULTS
 from .._system import State
 from .._types import Multipliers, Real, Scalar, Velocities
+from ._checks import check_derivative, check_formulation
 from ._decaying import (
     alpha_from_spectral_radius,
     as_alpha,
@@ -17,16 +18,14 @@ from ._decaying import (
     split_velocities,
 )
 from .base import (
-    AbstractSingleSolve,
-    check_derivative,
-    check_formulation,
+    AbstractSimplifiedSolve,
     Formulation,
     StepEnd,
     StepProblem,
 )
 
 
-class EnergyDecaying(AbstractSingleSolve[JumpAndEnd, StepProblem]):
+class EnergyDecaying(AbstractSimplifiedSolve[JumpAndEnd, StepProblem]):
     """Discontinuous Galerkin scheme: the energy decays by `alpha` times a jump.
 
     The state jumps from `z0` to `zj` at the start of the step and moves on to `z1`:
@@ -100,20 +99,44 @@ class EnergyDecaying(AbstractSingleSolve[JumpAndEnd, StepProblem]):
         return predict_jump_and_end(problem, acceleration, multipliers)
 
     def residual(self, z: JumpAndEnd, problem: StepProblem) -> JumpAndEnd:
+        nodes = self._nodes(z, problem, z)
+        return self._rows(z, problem, nodes, nodes, nodes)
+
+    def simplified(
+        self, z: JumpAndEnd, held: JumpAndEnd, problem: StepProblem
+    ) -> JumpAndEnd:
+        if not isinstance(problem.model, SeparableModel):
+            return self.residual(z, problem)
+        # As of `EnergyPreserving`.
+        parts = lambda z: (z.jump.velocity_impulse, z.end.velocity_impulse)
+        still = eqx.tree_at(parts, z, parts(held))
+        nodes, moving = self._nodes(z, problem, z), self._nodes(z, problem, held)
+        return self._rows(z, problem, nodes, moving, self._nodes(still, problem, held))
+
+    def _rows(
+        self,
+        z: JumpAndEnd,
+        problem: StepProblem,
+        nodes: tuple[State, State],
+        moving: tuple[State, State],
+        driven: tuple[State, State],
+    ) -> JumpAndEnd:
+        """The rows; the nodes differ in the reactions that are part of their velocities."""
         model, start, h = problem.model, problem.start, problem.h
-        jump, end = self._nodes(z, problem)
+        jump, end = nodes
         loads = jump_loads(self.alpha, z, problem, jump, end)
-        after = problem.drive(jump, end, z.end).less(loads.after)
-        before = problem.drive(start, jump, z.jump).less(loads.before)
+        after = problem.drive(*driven, z.end).less(loads.after)
+        before = problem.drive(start, driven[0], z.jump).less(loads.before)
         at_start = model.gradient(start, h).less(loads.start)
         at_jump = model.gradient(jump, h).less(loads.jump)
         to_jump = jump_drive(self.alpha, after, before, at_start, at_jump)
         return JumpAndEnd(
-            problem.rows(z.jump, jump, to_jump), problem.rows(z.end, end, after)
+            problem.rows(z.jump, jump, to_jump, moving[0]),
+            problem.rows(z.end, end, after, moving[1]),
         )
 
     def finish(self, z: JumpAndEnd, problem: StepProblem) -> StepEnd:
-        jump, end = self._nodes(z, problem)
+        jump, end = self._nodes(z, problem, z)
         kinetic, potential = jump_energy(problem, jump)
         dissipated = self.alpha.astype(kinetic.dtype) * (kinetic + potential)
         work = jump_work(self.alpha, z, problem, jump, end)
@@ -127,15 +150,19 @@ class EnergyDecaying(AbstractSingleSolve[JumpAndEnd, StepProblem]):
             RESULTS.successful,
         )
 
-    def _nodes(self, z: JumpAndEnd, problem: StepProblem) -> tuple[State, State]:
+    def _nodes(
+        self, z: JumpAndEnd, problem: StepProblem, held: JumpAndEnd
+    ) -> tuple[State, State]:
+        """After the jump and at the end, with their reactions where `held` is."""
         model, q0, v0 = problem.model, problem.start.q, problem.start.v
         # The jump takes no time.
         t0, t1 = problem.start.t, problem.end_time
         if not isinstance(model, SeparableModel):
             return problem.node(z.jump, t0), problem.node(z.end, t1)
         qj, q1 = problem.at(z.jump), problem.at(z.end)
-        after = model.mean_reaction(qj, t0, q1, t1, z.end.velocity_impulse)
-        before = model.mean_reaction(q0, t0, qj, t0, z.jump.velocity_impulse)
+        rj, r1 = (qj, q1) if held is z else map(problem.at, (held.jump, held.end))
+        after = model.mean_reaction(rj, t0, r1, t1, z.end.velocity_impulse)
+        before = model.mean_reaction(q0, t0, rj, t0, z.jump.velocity_impulse)
         vj, v1 = split_velocities(
             self.alpha,
             v0,

@@ -6,17 +6,16 @@ from .._model import AbstractModel, Increment, SeparableModel
 from .._results import RESULTS
 from .._system import State
 from .._types import Multipliers, Scalar, Velocities
+from ._checks import check_derivative, check_formulation
 from .base import (
-    AbstractSingleSolve,
-    check_derivative,
-    check_formulation,
+    AbstractSimplifiedSolve,
     Formulation,
     StepEnd,
     StepProblem,
 )
 
 
-class EnergyPreserving(AbstractSingleSolve[Increment, StepProblem]):
+class EnergyPreserving(AbstractSimplifiedSolve[Increment, StepProblem]):
     """Continuous Galerkin scheme: keeps the total energy, damps nothing.
 
     Solves `S(z0, z1, DH(z0, z1)) = 0` with the constraints at the end of the step.
@@ -64,13 +63,29 @@ class EnergyPreserving(AbstractSingleSolve[Increment, StepProblem]):
         return problem.guess(acceleration, multipliers)
 
     def residual(self, z: Increment, problem: StepProblem) -> Increment:
-        end = self._end(z, problem)
-        drive = problem.drive(problem.start, end, z)
+        end = self._end(z, problem, z)
+        return self._rows(z, problem, end, end, end)
+
+    def simplified(self, z: Increment, held: Increment, problem: StepProblem) -> Increment:
+        if not isinstance(problem.model, SeparableModel):
+            return self.residual(z, problem)
+        # In the velocity that `psi` is taken of, the reaction with the gradients as they
+        # are: these change it by as little as eta is small. In its drive, which has the
+        # factor eta, the whole reaction.
+        end, moving = self._end(z, problem, z), self._end(z, problem, held)
+        still = eqx.tree_at(lambda z: z.velocity_impulse, z, held.velocity_impulse)
+        return self._rows(z, problem, end, moving, self._end(still, problem, held))
+
+    def _rows(
+        self, z: Increment, problem: StepProblem, end: State, moving: State, driven: State
+    ) -> Increment:
+        """The rows; the ends differ in the reaction that is part of their velocities."""
+        drive = problem.drive(problem.start, driven, z)
         load = problem.step_load(end, z)
-        return problem.rows(z, end, drive.less(load))  # eq. (14a, c)
+        return problem.rows(z, end, drive.less(load), moving)  # eq. (14a, c)
 
     def finish(self, z: Increment, problem: StepProblem) -> StepEnd:
-        end = self._end(z, problem)
+        end = self._end(z, problem, z)
         drive_work = problem.drive_work(problem.start, end, z)
         nothing = jnp.zeros_like(problem.h)
         return StepEnd(
@@ -82,12 +97,14 @@ class EnergyPreserving(AbstractSingleSolve[Increment, StepProblem]):
             RESULTS.successful,
         )
 
-    def _end(self, z: Increment, problem: StepProblem) -> State:
+    def _end(self, z: Increment, problem: StepProblem, held: Increment) -> State:
+        """The end of the step, with its reaction where `held` is."""
         model, start = problem.model, problem.start
         if not isinstance(model, SeparableModel):
             return problem.node(z, problem.end_time)
         q1, t1 = problem.at(z), problem.end_time
         # eq. (14b), solved for the velocity
         mean = problem.velocity(z)
-        mean = mean - model.mean_reaction(start.q, start.t, q1, t1, z.velocity_impulse)
+        r1 = q1 if held is z else problem.at(held)
+        mean = mean - model.mean_reaction(start.q, start.t, r1, t1, z.velocity_impulse)
         return State(q1, 2 * mean - start.v, t1)

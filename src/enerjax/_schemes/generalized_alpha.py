@@ -15,10 +15,10 @@ from ._baseline import (
     plain_problem,
     reaction_force,
 )
+from ._checks import check_formulation
 from ._decaying import alpha_from_spectral_radius
 from .base import (
     AbstractCarryingSolve,
-    check_formulation,
     Formulation,
     StepEnd,
     StepProblem,

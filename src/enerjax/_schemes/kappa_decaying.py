@@ -8,6 +8,7 @@ from .._model import AbstractModel, Drive, Increment, SeparableModel
 from .._results import RESULTS
 from .._system import State
 from .._types import JointMultipliers, Multipliers, Scalar, Velocities
+from ._checks import check_derivative
 from ._decaying import (
     as_alpha,
     jump_drive,
@@ -20,7 +21,6 @@ from ._decaying import (
 )
 from .base import (
     AbstractSingleSolve,
-    check_derivative,
     Formulation,
     StepEnd,
     StepProblem,
