@@ -48,6 +48,7 @@ FUNCTIONS = {
     "concatenate": (lambda x: jnp.concatenate([x[:2], jnp.zeros(3), x[4:] ** 2]), True),
     "cross": (lambda x: jnp.cross(x[:3], x[3:6]), False),
     "stack": (lambda x: jnp.stack([x[0] * x[1], jnp.sin(x[2]), x[11]]), True),
+    "reordered": (lambda x: (x**2).reshape(3, 4).ravel(order="F"), True),
     "roll": (lambda x: jnp.roll(x, 1) * x, True),
     "vmap": (lambda x: jax.vmap(lambda i: x[i] * x[i + 1])(jnp.arange(11)), True),
     "outer": (lambda x: jnp.outer(x, x)[jnp.triu_indices(3)], True),

@@ -130,3 +130,27 @@ def test_lanes_that_need_the_exact_jacobian_move_alone():
         alone = jax.jit(root)(strength)
         np.testing.assert_allclose(lanes.value[k], alone.value, rtol=1e-12)  # solver
         assert lanes.iterations[k] == alone.iterations
+
+
+@pytest.mark.parametrize("off", [1e-3, 1e-7])
+def test_slow_corrections_are_not_taken_for_round_off(off):
+    """Each leaves about half of the one before, from where they are small on."""
+
+    def simplified(x, held, args):
+        near = 2 * x + 0.3 * jnp.sin(jnp.roll(x, 1).at[0].set(0)) - args
+        far = jnp.roll(held, 9).at[:9].set(0) + jnp.roll(held, -9).at[-9:].set(0)
+        return near + 0.5 * jnp.sin(far)
+
+    def root(guess, args):
+        return find_root(
+            lambda x, args: simplified(x, x, args), Newton(), guess, args,
+            max_iterations=50, simplified=simplified,
+        )  # fmt: skip
+
+    args = jnp.cos(jnp.arange(float(SIZE)))
+    noise = np.random.default_rng(0).normal(size=SIZE)
+    at = jax.jit(root)(jnp.zeros(SIZE), args).value
+    found = jax.jit(root)(at + off * noise, args)
+    assert found.found
+    rest = simplified(found.value, found.value, args)
+    assert jnp.max(jnp.abs(rest)) <= 100 * EPS  # round-off

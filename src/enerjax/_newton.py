@@ -150,10 +150,11 @@ def newton_iterations(
         ends = ends & (defect <= eps**0.875) & small
         # So has one with a Jacobian of its own; but where the residual is not tiny
         # (coordinates a million lengths off) only if it happens again and again, and never
-        # where it is not small: a residual can have a smallest value that is no root.
-        stalled = fresh & ~shrinks & small
+        # where it is not small: a residual can have a smallest value that is no root. With
+        # one that is not exact corrections can shrink slowly, and go on.
+        stalled = fresh & small & (~shrinks if residual.is_exact else contraction >= 1)
         stalls = jnp.where(fresh, jnp.where(stalled, before.stalls + 1, 0), before.stalls)
-        again_and_again = (stalls == _STALLS) & (defect <= eps**0.5)
+        again_and_again = (stalls == _STALLS) & (defect <= eps**0.5) & residual.is_exact
         ends = ends | (stalled & ((defect <= eps**0.75) | again_and_again))
         done = (converged | is_root | ends) & jnp.isfinite(size)
         kept = fresh | shrinks | is_root

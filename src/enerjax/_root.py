@@ -105,7 +105,7 @@ def _search(
         near = narrowed(exact, flat_simplified, flat, args)
     if near is None:
         return _iterated(exact, root_finder, start, max_iterations)
-    first = _iterated(near, root_finder, start, PATIENCE)
+    first = _iterated(near, root_finder, start, min(PATIENCE, max_iterations))
 
     def again() -> Root:
         # (The lanes of a batch all come here.)

@@ -8,6 +8,7 @@ not computed with respect to multipliers too.
 """
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -172,8 +173,9 @@ def _equation(equation: Any, values: list[Any], count: int) -> list[Any]:
 def _known_move(value: _Columns, move: Callable, params: dict[str, Any]) -> list[_Columns]:
     """Of the seeds, before the arithmetic begins: they show which columns are zero."""
     shape = value.array.shape[:-1]
-    rows = np.reshape(value.array, (-1, len(value.numbers)))
-    outs = move(np.arange(rows.shape[0]).reshape(shape), **params)
+    places = np.arange(math.prod(shape))
+    rows = np.reshape(value.array, (places.size, len(value.numbers)))
+    outs = move(places.reshape(shape), **params)
     return [_trimmed(rows[out], value.numbers.start) for out in outs]
 
 

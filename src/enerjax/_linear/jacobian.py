@@ -70,6 +70,11 @@ class Linearisable(eqx.Module):
         return isinstance(self.form, Full) and self.form.solver is None
 
     @property
+    def is_exact(self) -> bool:
+        """Whether `jacobian` is that of `value`."""
+        return self.near is None
+
+    @property
     def keeps_factors(self) -> bool:
         """Whether the next iteration can begin with the factors of this one."""
         return self.is_dense and self.fill is None

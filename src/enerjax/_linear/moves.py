@@ -14,6 +14,10 @@ def _broadcast_in_dim(x, *, shape, broadcast_dimensions, **_):
     return [np.broadcast_to(np.reshape(x, lengths), shape)]
 
 
+def _reshape(x, *, new_sizes, dimensions=None, **_):
+    return [np.reshape(x if dimensions is None else np.transpose(x, dimensions), new_sizes)]
+
+
 def _slice(x, *, start_indices, limit_indices, strides, **_):
     steps = strides or (1,) * np.ndim(x)
     ranges = zip(start_indices, limit_indices, steps, strict=True)
@@ -44,7 +48,7 @@ MOVES: dict[str, Callable] = {
     "concatenate": lambda *xs, dimension, **_: [np.concatenate(xs, dimension)],
     "copy": lambda x, **_: [x],
     "pad": _pad,
-    "reshape": lambda x, *, new_sizes, **_: [np.reshape(x, new_sizes)],
+    "reshape": _reshape,
     "rev": lambda x, *, dimensions, **_: [np.flip(x, dimensions)],
     "slice": _slice,
     "split": _split,
