@@ -183,16 +183,13 @@ def narrowed(
 
     `None` where that is no narrower band: then nothing is gained.
     """
-    fill, near = exact.fill, lambda held: plain_products(simplified, like, (held, args))
-    at = near(like)
-    pattern = jacobian_pattern(at if fill is None else lambda x: at(x) + fill * x, like)
-    if pattern is None:
+    band = linearisable(simplified, like, (like, args), fill=exact.fill).form
+    if not isinstance(band, Band):
         return None
-    band, form = Band(pattern), exact.form
-    narrower = not isinstance(form, Band) or band.width < form.width
-    if not (band.worth_it() and narrower):
+    if isinstance(exact.form, Band) and band.width >= exact.form.width:
         return None
-    return Linearisable(exact.value, band, fill, near)
+    near = lambda held: plain_products(simplified, like, (held, args))
+    return Linearisable(exact.value, band, exact.fill, near)
 
 
 class RowPattern:
