@@ -10,6 +10,7 @@ from enerjax._linear import eigh
 from enerjax._newton import Newton
 from enerjax._one_function import in_one_function
 from enerjax._root import find_root
+from enerjax._tracing import programs_within
 
 from .test_one_function import is_marked, pytestmark, X
 
@@ -29,6 +30,9 @@ def test_derivatives_and_lanes():
         lambda f: jax.jvp(f, (X,), (X,)),
         lambda f: jax.grad(total(f))(X),
         lambda f: jax.jvp(jax.grad(total(f)), (X,), (X,)),
+        lambda f: (jax.jacfwd(f)(X), jax.jacrev(f)(X), jax.hessian(total(f))(X)),
+        lambda f: jax.grad(lambda x: total(jax.grad(total(f)))(x))(X),
+        lambda f: jax.linear_transpose(jax.linearize(f, X)[1], X)(X),
         lambda f: jax.vmap(f)(xs),
         lambda f: jax.vmap(jax.grad(total(f)))(xs),
         lambda f: jax.vmap(jax.vmap(f))(xs[None]),
@@ -172,6 +176,54 @@ def test_inputs_that_turn_out_to_be_constant():
     difference = (end(1.2 + 1e-5) - end(1.2 - 1e-5)) / 2e-5
     # Truncation of the difference and round-off over its width.
     np.testing.assert_allclose(rate, difference, rtol=0, atol=1e-9)
+
+
+def in_loops(jaxpr, inside=False):
+    """What loops consist of, outside of what is one function."""
+    for eqn in jaxpr.eqns:
+        name = eqn.primitive.name
+        if inside:
+            yield name
+        if name != "enerjax_one_function":
+            for inner in programs_within(eqn):
+                yield from in_loops(inner, inside or name in ("scan", "while"))
+
+
+def test_runs_of_small_systems_are_one_function():
+    """And so are their derivatives: nothing is left but sums over segments."""
+    system, start, args = ej.problems.pendulum()
+    run = lambda args: ej.simulate(
+        system, ej.EnergyPreserving(), start, args, h=0.01, num_steps=200, throw=False
+    )
+    assert is_marked(run, args)
+    slope = jax.grad(lambda args: jnp.sum(run(args).ys.q))
+    for fn in (slope, lambda args: jax.jvp(slope, (args,), (args,))):
+        assert is_marked(fn, args)
+        left = set(in_loops(jax.make_jaxpr(fn)(args).jaxpr))
+        assert left == {"enerjax_one_function", "add_any"}
+
+
+def test_without_compiling_and_where_nans_are_looked_for():
+    system, start, args = ej.problems.pendulum()
+    step = lambda: ej.step(system, ej.EnergyPreserving(), start, args, h=0.01).state.q
+    with jax.disable_jit():
+        plain = step()
+    np.testing.assert_allclose(plain, step(), rtol=1e-13)  # where Newton stops
+    root = in_one_function(lambda x: jnp.sqrt(x - 1))
+    with jax.debug_nans(True):
+        np.testing.assert_array_equal(plain, plain * root(jnp.array(2.0)))
+        for fn in (root, jax.jit(root)):
+            with pytest.raises(FloatingPointError):
+                fn(jnp.array(0.5))
+
+
+def test_numbers_of_other_kinds():
+    keys = jax.random.split(jax.random.key(0))
+    draw = lambda keys, x: (jax.random.uniform(keys[1]), jnp.sin(x))
+    assert in_one_function(draw)(keys, 1.0) == draw(keys, 1.0)
+    small = jnp.ones(3, jnp.int4)
+    assert (in_one_function(lambda x: x + x)(small) == small + small).all()
+    assert isinstance(in_one_function(lambda x: x)(2.0), jax.Array)
 
 
 def test_nothing_outlives_its_trace():

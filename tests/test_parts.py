@@ -5,9 +5,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import enerjax as ej
 from enerjax import problems
 from enerjax._kinematics import ConfigurationKinematics
-from enerjax._linear import constant_entries, multiply_parts, parts_of, solve_parts
+from enerjax._linear import (
+    constant_entries,
+    inverse,
+    jacobian_pattern,
+    multiply_parts,
+    parts_of,
+    solve_parts,
+)
 from enerjax._model import make_model, SeparableModel
 
 
@@ -102,3 +110,19 @@ def test_a_body_in_euler_parameters_is_a_place_and_a_rotation(jit):
         (0, (3, 1)),
         (4, (1, 4)),
     ]
+
+
+def test_derivatives_of_inverses_are_seen_through():
+    """They keep the name of the inverse, and have more inputs and outputs."""
+    matrix = lambda x: jnp.outer(x, jnp.sin(x)) + 3 * jnp.eye(x.size)
+    value = lambda x: x @ inverse(matrix(x)) @ x
+    a, b = jnp.array([0.3, 0.5, 0.9]), jnp.array([0.5, 0.4, 1.3])
+    along = lambda x: jax.jvp(value, (x,), (jnp.cos(x),))[1]
+    for fn in (value, along, jax.grad(value), jax.hessian(value)):
+        change = ej.discrete_jvp(fn, a, b)(b - a)
+        # Round-off of numbers of order one.
+        np.testing.assert_allclose(change, fn(b) - fn(a), rtol=0, atol=1e-15)
+    apart = lambda x: jnp.sum(jax.vmap(value)(x.reshape(10, 4)))
+    found = jacobian_pattern(jax.grad(apart), jnp.linspace(0.1, 0.9, 40))
+    assert found is not None
+    np.testing.assert_array_equal(found.toarray(), np.kron(np.eye(10), np.ones((4, 4))))

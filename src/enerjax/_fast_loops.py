@@ -19,12 +19,12 @@ if jaxlib.version.__version_info__ >= (0, 10, 2):
 def enable_fast_loops() -> None:
     """Let XLA compile a whole time loop into one function, on CPUs.
 
-    Larger systems (of 64 unknowns and more) and derivatives of runs are then faster, the
-    latter up to twice; loops over the steps of small systems are compiled so without it. It
-    is your decision, as it holds for all of JAX in the process: it appends to the
-    environment variable `XLA_FLAGS` and starts the CPU back end. Call it right after the
-    imports, before the first array is made (and after `jax.distributed.initialize`, if you
-    use it). Other processors are not affected.
+    Runs of small systems and their derivatives are compiled so without it, where they can
+    be. Larger systems, and models with operations that a single function cannot have, can
+    be faster with it: measure yours. It is your decision, as it holds for all of JAX in the
+    process: it appends to the environment variable `XLA_FLAGS` and starts the CPU back end.
+    Call it right after the imports, before the first array is made (and after
+    `jax.distributed.initialize`, if you use it). Other processors are not affected.
 
     **Raises:** `RuntimeError` if the back end had started before, so that the setting came
     too late (or was not understood by this version of XLA).

@@ -144,7 +144,7 @@ def _root(fn, simplified, root_finder, args, start, max_iterations):
 def _root_jvp(primals, tangents):
     fn, simplified, root_finder, args, start, max_iterations = primals
     t_args = tangents[3]
-    # Where derivatives are taken the loop around is no longer one function.
+    # Apart: derivatives neither trace nor need how it is found.
     search = lambda: _root(fn, simplified, root_finder, args, start, max_iterations)
     root = in_one_function(search)()
     # All that the derivatives of a step need of the search for it.

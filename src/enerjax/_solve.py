@@ -83,6 +83,7 @@ def first_memory(
     z = scheme.predict(problem, acceleration, multipliers)
     flight = _free_flight(scheme, problem, model, start)
     added = jax.tree.map(lambda x, x0: jnp.stack([x - x0] * 3), z, flight)
+    added = jax.lax.stop_gradient(added)
     flat, _ = ravel_pytree(flight)
     factors = kept_factors(flat.size, flat.dtype)
     return Memory(added, jnp.array(True), factors, carried)

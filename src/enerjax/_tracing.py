@@ -79,5 +79,7 @@ def _programs(params: Any) -> Iterator[Jaxpr]:
             yield param.jaxpr
         elif isinstance(param, Jaxpr):
             yield param
+        elif isinstance(getattr(param, "jaxpr", None), Jaxpr):
+            yield param.jaxpr
         elif isinstance(param, tuple | list):
             yield from _programs(param)

@@ -99,7 +99,8 @@ class Walk:
             return evaluate(primitive, values, params)
         inner = wrapped_program(equation)
         named = self._rules.get(f"jit {params.get('name')}")
-        if named is not None:
+        # (A derivative of what has a name keeps it, and has more inputs or outputs.)
+        if named is not None and len(values) == len(equation.outvars) == 1:
             return named(values, dict(params, walk=self, primitive=primitive))
         if inner is not None:
             return self.open(*inner, values)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .._one_function import unmerged
+from .._one_function import LARGEST_SUM, unmerged
 from .._types import Flag, Scalar
 from .norms import largest
 
@@ -24,26 +24,20 @@ SMALL = 32
 _UNROLLED = 3
 
 
-@jax.custom_jvp
 def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """The inverse; not finite where the matrix is singular."""
     return enerjax_inverse(matrix)
 
 
-@inverse.defjvp
-def _inverse_jvp(primals, tangents):
-    # Matrix products alone, however often it is differentiated.
-    (x,), (dx,) = primals, tangents
-    y = inverse(x)
-    return y, -product(product(y, dx), y)
-
-
 @jax.jit
 def enerjax_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """By Gauss-Jordan elimination in place with row pivoting; rows are not exchanged.
+    """The discrete derivative and the patterns know it by its name, also under `vmap`."""
+    return _inverse(matrix)
 
-    The discrete derivative and the patterns know it by its name, also under `vmap`.
-    """
+
+@jax.custom_jvp
+def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """By Gauss-Jordan elimination in place with row pivoting; rows are not exchanged."""
     size = matrix.shape[0]
     if size == 1:
         return 1 / matrix
@@ -53,14 +47,16 @@ def enerjax_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
     def column(k, carry):
         table, free, rows, columns = carry
-        entries = jnp.sum(jnp.where((order == k)[None], table, 0), axis=1)
+        entries = jax.lax.dynamic_slice(table, (0, k), (size, 1))[:, 0]
         sizes = jnp.where(free, jnp.abs(entries), -1)
         # The first of the largest: cheaper as two plain reductions than `argmax`. (Where
-        # an entry is not a number there is none, and all becomes so.)
+        # an entry is not a number there is none.)
         pivot = jnp.min(jnp.where(sizes == jnp.max(sizes), order, size))
         chosen = order == pivot
-        row = jnp.sum(jnp.where(chosen[:, None], table, 0), axis=0)
-        entry = jnp.sum(jnp.where(chosen, entries, 0))
+        row = jax.lax.dynamic_slice(table, (pivot, 0), (1, size))[0]
+        entry = jax.lax.dynamic_slice(entries, (pivot,), (1,))[0]
+        # All becomes so then.
+        entry = jnp.where(pivot < size, entry, jnp.nan)
         # The unknown of the column and the right-hand side of the row change places.
         row = jnp.where(order == k, 1, row) / entry
         factors = jnp.where(chosen, 0, entries)
@@ -77,6 +73,21 @@ def enerjax_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
         carry = jax.lax.fori_loop(0, size, column, carry)
     table, _, rows, columns = carry
     return table[rows][:, columns]
+
+
+@_inverse.defjvp
+def _inverse_jvp(primals, tangents):
+    # Matrix products alone, however often it is differentiated.
+    (x,), (dx,) = primals, tangents
+    y = inverse(x)
+    return y, -_sums(_sums(y, dx), y)
+
+
+def _sums(a: Float[Array, "n n"], b: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """`a @ b`; many tangents of it at once are faster so."""
+    if a.shape[0] ** 3 > LARGEST_SUM:
+        return product(a, b)
+    return jnp.sum(a[:, :, None] * b[None], axis=1)
 
 
 class AbstractFactors(eqx.Module):

@@ -6,10 +6,10 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array, PyTree
 
+from .._one_function import written_out
 from .._tracing import evaluate, interpret
 
 
@@ -43,17 +43,8 @@ def _equation(equation: Any, values: list[Any]) -> list[Any]:
         return interpret(inner.jaxpr, inner.consts, values, _equation)
     if primitive.name == "dot_general":
         left, right = values
-        contracted, batch = params["dimension_numbers"]
-        one = _rows(left, contracted[0], batch[0])
-        other = _rows(right, contracted[1], batch[1])
-        if one.size * other.shape[1] <= _SMALL:
-            out = jnp.sum(one[:, :, None] * other[:, None], axis=-1)
-            return [out.reshape(equation.outvars[0].aval.shape)]
+        numbers = params["dimension_numbers"]
+        count = math.prod(left.shape[k] for k in numbers[0][0])
+        if equation.outvars[0].aval.size * count <= _SMALL:
+            return [written_out(left, right, numbers)]
     return evaluate(primitive, values, params)
-
-
-def _rows(x: Array, contracted: tuple[int, ...], batch: tuple[int, ...]) -> Array:
-    """As (batch, free, contracted)."""
-    free = [k for k in range(x.ndim) if k not in (*contracted, *batch)]
-    sizes = [math.prod(x.shape[k] for k in axes) for axes in (batch, free, contracted)]
-    return jnp.transpose(x, (*batch, *free, *contracted)).reshape(sizes)

@@ -56,7 +56,8 @@ def _identity(size: int) -> csr_array:
 def _equation(equation: Any, values: list[Value], of_values: bool) -> list[Value]:
     primitive, params = equation.primitive, equation.params
     avals = [var.aval for var in equation.outvars]
-    named = RULES.get(f"jit {params.get('name')}")
+    # (A derivative of what has a name keeps it, and has more inputs or outputs.)
+    named = RULES.get(f"jit {params.get('name')}") if len(values + avals) == 2 else None
     inner = wrapped_program(equation)
     if named is None and inner is not None:
         rule = functools.partial(_equation, of_values=of_values)

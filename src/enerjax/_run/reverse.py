@@ -39,7 +39,7 @@ def keep_roots(fn: Body) -> Body:
 def scans(rows: int, steps: int) -> tuple[Scan, Scan]:
     """The loops over the rows of a run, and over the steps of a row."""
     segment = math.isqrt(rows * steps)
-    keep = keep_roots if rows * steps <= LONG else _checkpoint
+    keep = _checkpoint if rows * steps > LONG else lambda fn: fn
     # One of both loops is cut: a segment is a group of rows, or a part of one.
     if steps > segment:
         return jax.lax.scan, functools.partial(_in_segments, keep, segment)
@@ -50,7 +50,7 @@ def scan_until(done: Callable[[Any], Array], length: int) -> Scan:
     """A loop of at most `length` steps, over once `done(carry)`: what is left of its
     segments costs nothing then, and what it hands out there is zero. In a batch the last
     lane decides."""
-    keep = keep_roots if length <= LONG else _checkpoint
+    keep = _checkpoint if length > LONG else lambda fn: fn
     return functools.partial(_in_segments, keep, math.isqrt(length), done=done)
 
 
@@ -70,7 +70,8 @@ def _in_segments(
     length = live.size
     size = min(range((about + 1) // 2, 2 * about + 1), key=lambda size: -length % size)
     live = jnp.append(live, jnp.zeros((-length % size,), bool)).reshape(-1, size)
-    segment = keep(in_one_function(lambda carry, live: jax.lax.scan(body, carry, live)))
+    whole = keep_roots(lambda carry, live: jax.lax.scan(body, carry, live))
+    segment = keep(in_one_function(whole))
     if done is not None:
         segment = _unless(done, segment)
     carry, out = jax.lax.scan(segment, carry, live)

@@ -1,0 +1,219 @@
+"""A primitive of JAX that runs a program as one function, as its derivatives are run."""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, Primitive
+from jax.interpreters import ad, batching, mlir
+from jax.interpreters.partial_eval import dce_jaxpr_consts
+from jaxtyping import Array, PyTree
+
+from .marks import marked
+from .possible import is_possible
+from .rewriting import as_index, REWRITTEN, rewritten
+
+
+def call(fn: Callable[..., PyTree[Array]], *args: PyTree[Array]) -> PyTree[Array]:
+    """`fn(*args)` in one function, if it can be."""
+    closed, like = jax.make_jaxpr(fn, return_shape=True)(*args)
+    out = _run(closed, jax.tree.leaves(args), [True] * len(closed.out_avals))
+    return jax.tree.unflatten(jax.tree.structure(like), map(jnp.asarray, out))
+
+
+class _Program:
+    """A program as the parameter of a primitive.
+
+    - `jaxpr`: its constants come first among the inputs, for they can be traced, and would
+      outlive their trace.
+    - `known`: the values of inputs that are indices and known, else `None`.
+    - `linear`: of how many of the last inputs it is a linear function.
+    """
+
+    def __init__(self, jaxpr: Any, known: Sequence[np.ndarray | None], linear: int):
+        self.jaxpr = jaxpr
+        self.known = known
+        self.linear = linear
+        # What is run instead, and what is put into it. (Derivatives are of the program.)
+        self._fixed = [None] * len(known) if is_possible(jaxpr) else known
+        self._run = None
+        # What is evaluated by itself is compiled once.
+        self.compiled = jax.jit(lambda *numbers: self.run(numbers))
+        if is_possible(jaxpr, besides=REWRITTEN):
+            run = rewritten(jaxpr, self._fixed)
+            self._run = run if run.in_avals and is_possible(run.jaxpr) else None
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether it can be one function."""
+        return self._run is not None
+
+    def run(self, numbers: Sequence[Array]) -> list[Array]:
+        """What it returns, from one function."""
+        assert self._run is not None
+        jaxpr, consts = self._run.jaxpr, list(map(jnp.asarray, self._run.consts))
+        pairs = zip(numbers, self._fixed, strict=True)
+        inputs = [*consts, *(x for x, fixed in pairs if fixed is None)]
+
+        def program(inputs: Sequence[Array]) -> list[Array]:
+            closed = ClosedJaxpr(jaxpr, list(inputs[: len(consts)]))
+            return jaxpr_as_fun(closed)(*inputs[len(consts) :])
+
+        return marked(program, inputs)
+
+    def __call__(self, numbers: Sequence[Array]) -> list[Array]:
+        pairs = zip(numbers, self.known, strict=True)
+        values = [x if known is None else known for x, known in pairs]
+        count = len(self.jaxpr.constvars)
+        closed = ClosedJaxpr(self.jaxpr, values[:count])
+        return jaxpr_as_fun(closed)(*values[count:])
+
+
+def _run(
+    closed: ClosedJaxpr, inputs: Sequence[Any], wanted: Sequence[bool], linear: int = 0
+) -> list[Any]:
+    """The outputs of a program that are wanted, in one function where that is possible.
+
+    And `None` for the others. Inputs that are handed through are not copied.
+    """
+    numbers = [*closed.consts, *inputs]
+    variables = (*closed.jaxpr.constvars, *closed.jaxpr.invars)
+    given = {id(x): number for x, number in zip(variables, numbers, strict=True)}
+    through = [id(x) in given for x in closed.jaxpr.outvars]
+    made = [on and not same for on, same in zip(wanted, through, strict=True)]
+    jaxpr, of_consts, of_inputs = dce_jaxpr_consts(closed.jaxpr, made)
+    needed, _ = _split([*of_consts, *of_inputs], numbers)
+    linear = sum(of_inputs[len(of_inputs) - linear :])
+    program = _Program(jaxpr, list(map(as_index, needed)), linear)
+    needed = list(map(jnp.asarray, needed))
+    if any(made) and program.is_possible:
+        out = ONE_FUNCTION.bind(*needed, program=program)
+    else:
+        out = program(needed)
+    _, variables = _split(made, closed.jaxpr.outvars)
+    _, asked = _split(made, wanted)
+    pairs = zip(variables, asked, strict=True)
+    return _merged(made, out, [given[id(x)] if on else None for x, on in pairs])
+
+
+ONE_FUNCTION = Primitive("enerjax_one_function")
+ONE_FUNCTION.multiple_results = True
+
+
+@ONE_FUNCTION.def_impl
+def _evaluated(*numbers: Array, program: _Program) -> list[Array]:
+    # (A new `jit` of this primitive would come back here where JAX looks for NaNs.)
+    is_apart = jax.config.jax_disable_jit  # pyright: ignore[reportAttributeAccessIssue]
+    return program(numbers) if is_apart else program.compiled(*numbers)
+
+
+@ONE_FUNCTION.def_abstract_eval
+def _shapes(*_: Any, program: _Program) -> list[Any]:
+    return [x.aval for x in program.jaxpr.outvars]
+
+
+def _jvp(primals: Any, tangents: Any, *, program: _Program) -> tuple[list, list]:
+    """The values with what their rates need in one function, and the rates in another."""
+    moves = [not isinstance(t, ad.Zero) for t in tangents]
+    moved, _ = _split(moves, tangents)
+    smooth = [jnp.issubdtype(x.aval.dtype, jnp.inexact) for x in program.jaxpr.outvars]
+
+    def linearised(*numbers):
+        own, still = _split(moves, numbers)
+        values = lambda *own: _split(smooth, program(_merged(moves, own, still)))
+        return jax.linearize(values, *own, has_aux=True)
+
+    closed, like = jax.make_jaxpr(linearised, return_shape=True)(*primals)
+    pushed = jax.make_jaxpr(lambda push, moved: push(*moved))(like[1], moved)
+    depends = _depends(pushed, len(moved))
+    _, _, uses = dce_jaxpr_consts(pushed.jaxpr, depends)
+    # Of the values, what the rates need of them, and the values without rates.
+    num_values, num_others = sum(smooth), len(smooth) - sum(smooth)
+    num_kept = len(closed.out_avals) - len(smooth)
+    wanted = [True] * num_values + uses[:num_kept] + [True] * num_others
+    out = _run(closed, primals, wanted)
+    kept = out[num_values : num_values + num_kept]
+    rates = _run(pushed, [*kept, *moved], depends, len(moved))
+    out = _merged(smooth, out[:num_values], out[num_values + num_kept :])
+    rates = _merged(smooth, rates, [None] * num_others)
+    zeros = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in out]
+    return out, [z if x is None else x for x, z in zip(rates, zeros, strict=True)]
+
+
+def _depends(closed: ClosedJaxpr, linear: int) -> list[bool]:
+    """Which outputs of a program depend on the last of its inputs."""
+    jaxpr: Any = closed.jaxpr
+    on = {id(x) for x in jaxpr.invars[len(jaxpr.invars) - linear :]}
+    for eqn in jaxpr.eqns:
+        if any(id(x) in on for x in eqn.invars):
+            on.update(id(x) for x in eqn.outvars)
+    return [id(x) in on for x in jaxpr.outvars]
+
+
+def _transpose(cotangents: Any, *numbers: Any, program: _Program) -> list:
+    wanted = [ad.is_undefined_primal(x) for x in numbers]
+    unknown, known = _split(wanted, numbers)
+    given = [not isinstance(ct, ad.Zero) for ct in cotangents]
+    cotangents, _ = _split(given, cotangents)
+
+    def pulled(known, cotangents):
+        push = lambda *own: _split(given, program(_merged(wanted, own, known)))[0]
+        return jax.linear_transpose(push, *(x.aval for x in unknown))(cotangents)
+
+    closed = jax.make_jaxpr(pulled)(known, cotangents)
+    depends = _depends(closed, len(cotangents))
+    out = _run(closed, [*known, *cotangents], depends, len(cotangents))
+    zeros = [ad.Zero(x.aval) for x in unknown]
+    out = [x if on else zero for on, x, zero in zip(depends, out, zeros, strict=True)]
+    return _merged(wanted, out, [None] * len(known))
+
+
+def _lanes(numbers: Any, axes: Any, *, program: _Program) -> tuple[list, list[int]]:
+    batched = [axis is not None for axis in axes]
+    own, shared = _split(batched, numbers)
+    axes, _ = _split(batched, axes)
+    own = [jnp.moveaxis(x, axis, 0) for x, axis in zip(own, axes, strict=True)]
+    of_lane = lambda own: program(_merged(batched, own, shared))
+    still = len(batched) - program.linear
+    if any(map(_is_sharded, own)):
+        # Each device has lanes of its own.
+        out = jax.vmap(of_lane)(own)
+    elif program.linear and not any(batched[:still]):
+        # Directions at one point, side by side: they share all but themselves.
+        closed = jax.make_jaxpr(jax.vmap(of_lane))(own)
+        out = _run(closed, own, [True] * len(closed.out_avals), len(own))
+    else:
+        # One after the other: for few lanes the calls of the operations take longer than
+        # all of a lane, and many do not fit into the cache.
+        bind = functools.partial(ONE_FUNCTION.bind, program=program)
+        out = jax.lax.map(lambda own: bind(*_merged(batched, own, shared)), own)
+    return out, [0] * len(out)
+
+
+def _is_sharded(x: Array) -> bool:
+    """Over the axes of a mesh that JAX has as parts of types."""
+    return any(axis is not None for axis in jax.typeof(x).sharding.spec)
+
+
+def _lowered(*numbers: Array, program: _Program) -> list[Array]:
+    return program.run(numbers)
+
+
+ad.primitive_jvps[ONE_FUNCTION] = _jvp
+ad.primitive_transposes[ONE_FUNCTION] = _transpose
+batching.primitive_batchers[ONE_FUNCTION] = _lanes
+mlir.register_lowering(ONE_FUNCTION, mlir.lower_fun(_lowered))
+
+
+def _split(which: Sequence[bool], values: Sequence[Any]) -> tuple[list, list]:
+    pairs = list(zip(which, values, strict=True))
+    return [x for on, x in pairs if on], [x for on, x in pairs if not on]
+
+
+def _merged(which: Sequence[bool], chosen: Sequence[Any], rest: Sequence[Any]) -> list:
+    """What `_split` has split."""
+    left, others = iter(chosen), iter(rest)
+    return [next(left if on else others) for on in which]

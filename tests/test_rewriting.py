@@ -1,0 +1,95 @@
+"""What XLA cannot do inside of one function, said in other words: the same values."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import enerjax as ej
+from enerjax._one_function import in_one_function
+
+from .test_one_function import is_marked, pytestmark
+
+
+__all__ = ["pytestmark"]
+
+X = jnp.sin(jnp.arange(1.0, 13.0)).reshape(3, 4)
+TWICE = np.array([2, 0, 2, 2])
+ROWS, COLUMNS = np.array([[0], [2]]), np.array([[3, 1], [0, 3]])
+OUTSIDE = np.array([-1, 7, 1, 4])
+
+
+def matrices(x, y, subscripts):
+    return jnp.einsum(subscripts, jnp.tile(x, (4, 3)), jnp.tile(y, (4, 3)))
+
+
+def every_place(x):
+    """With shared axes, as `vmap` makes them."""
+    one = lambda row, k: row.at[k].add(row[:2])
+    return jax.vmap(one)(x, COLUMNS[[0, 1, 0]])
+
+
+def of_loops(x):
+    lax = jax.lax
+    add = lambda x: jnp.sin(x).at[:, TWICE].add(x)
+    turn = lambda c, y: (add(c), c[0].at[TWICE].set(y))
+    until = lambda c: (c[0] + jnp.zeros(9, int).at[TWICE].add(1)[0], add(c[1]))
+    return [
+        lax.scan(turn, x, x, reverse=True),
+        lax.scan(lambda c, _: (add(c), None), x, None, length=3)[0],
+        lax.while_loop(lambda c: c[0] < 3, until, (0, x)),
+        lax.cond(x[0, 0] > 0, add, jnp.cos, x),
+        lax.switch((9 * x[0, 0]).astype(int), [jnp.sin, add, jnp.cos], x),
+        jax.jit(add)(x),
+        jax.checkpoint(add)(x),
+        in_one_function(add)(x),
+    ]
+
+
+IN_OTHER_WORDS = {
+    "put": lambda x: x.at[ROWS, COLUMNS].set(jnp.cos(x[:2, :2])),
+    "put twice": lambda x: x.at[:, TWICE].set(1 + 0 * x),
+    "add twice": lambda x: x.at[:, TWICE].add(jnp.cos(x)),
+    "rows": lambda x: x.at[jnp.array([2, 0])].add(jnp.cos(x[:2])),
+    "windows": lambda x: x.at[1:, 1:3].add(x[:2, :2]).at[0].set(2.0),
+    "outside": lambda x: x.at[0, OUTSIDE].add(x[1]).at[2, OUTSIDE].set(x[1], mode="drop"),
+    "clipped": lambda x: x.at[0, OUTSIDE].add(x[1], mode="clip"),
+    "whole numbers": lambda x: x[0].astype(int).at[TWICE].add(3),
+    "places": every_place,
+    "nothing": lambda x: (2 * x).at[np.zeros(0, int)].add(1.0),
+    "slope": jax.grad(lambda x: jnp.sum(jnp.sin(x[:, TWICE] * x) ** 2)),
+    "curvature": jax.hessian(lambda x: jnp.sum(jnp.sin(x[ROWS, COLUMNS]) ** 3)),
+    "matrices": lambda x: matrices(x, x, "ij,kj->ik"),
+    "transposed": lambda x: matrices(x, x.T[:3, :2], "ij,ik->jk"),
+    "long rows": lambda x: jnp.einsum("ij,jkl->ikl", x, jnp.tile(x[0, :, None, None], 4)),
+    "many matrices": lambda x: jnp.einsum("nij,nkj->nki", *[jnp.tile(x, (4, 3, 3))] * 2),
+    "loops": of_loops,
+}
+
+
+@pytest.mark.parametrize("name", IN_OTHER_WORDS)
+def test_values_and_derivatives(name):
+    fn = IN_OTHER_WORDS[name]
+    other = in_one_function(fn)
+    assert is_marked(other, X)
+
+    def seen(fn):
+        total = lambda x: sum(jnp.sum(jnp.sin(y)) for y in jax.tree.leaves(fn(x)))
+        # (A `while` has no reverse mode.)
+        reverse = jax.grad(total) if name != "loops" else jnp.sin
+        return fn(X), jax.jvp(fn, (X,), (jnp.cos(X),))[1], reverse(X)
+
+    # Round-off, of sums whose terms are of order one.
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-13)
+    float0 = jax.dtypes.float0
+    numbers = lambda tree: [x for x in jax.tree.leaves(tree) if x.dtype != float0]
+    jax.tree.map(close, numbers(jax.jit(lambda: seen(other))()), numbers(seen(fn)))
+
+
+@pytest.mark.parametrize("name", ["four_bar", "car_axis", "heavy_top_directors"])
+def test_scenes_are_one_function(name):
+    system, start, args = getattr(ej.problems, name)()
+    run = lambda args: ej.simulate(
+        system, ej.EnergyPreserving(), start, args, h=1e-3, num_steps=20, throw=False
+    )
+    assert is_marked(run, args)
