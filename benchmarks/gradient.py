@@ -35,7 +35,7 @@ FORWARD_BOUND, DIFFERENCE_BOUND = 1e-8, 1e-5
 CASES = [
     ("double pendulum", lambda: ej.problems.chain(2, 2.0, 2.0), "preserving", 8),
     ("double pendulum", lambda: ej.problems.chain(2, 2.0, 2.0), "decaying", 16),
-    ("heavy top", ej.problems.heavy_top, "preserving", 13),
+    ("heavy top", ej.problems.heavy_top, "preserving", 14),
     ("chain of 64", lambda: ej.problems.chain(64), "preserving", 256),
 ]
 

@@ -32,6 +32,8 @@ PENDULUM = [
     ("EnergyConsistent(0.0)", 2.5e-3, 1e-5),
     ("EnergyConsistent(0.0)", 1e-2, 1e-2),
     ("EnergyConsistent(0.0)", 2.5e-2, 1e-2),
+    ("EnergyConsistent(0.0)", 1 / 36, 1e-2),
+    ("Composed(EnergyConsistent(0.0), 6)", 1 / 35, 1e-6),
     ("Composed(EnergyPreserving(), 4)", 4e-3, 1e-3),
     ("Composed(EnergyPreserving(), 4)", 2e-2, 1e-3),
 ]
