@@ -44,6 +44,17 @@ def evaluate(primitive: Any, values: list[Any], params: dict[str, Any]) -> list[
     return list(out) if primitive.multiple_results else [out]
 
 
+def name_of(equation: Any) -> str:
+    """Under which name rules know it: that of its primitive, or `jit f`, where it calls a
+    function `f` of one array, which returns one, under `jax.jit`."""
+    name = equation.primitive.name
+    # (A derivative of what has a name keeps it, and has more inputs or outputs.)
+    if name in _JIT and len(equation.invars) == len(equation.outvars) == 1:
+        return f"jit {equation.params['name']}"
+    return name
+
+
+_JIT = ("jit", "pjit")
 # Primitives that only wrap a program, and the parameter that holds it.
 _WRAPPERS = {
     "jit": "jaxpr",

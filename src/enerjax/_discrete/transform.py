@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array
 
-from .._tracing import evaluate, interpret, wrapped_program
+from .._tracing import evaluate, interpret, name_of, wrapped_program
 
 
 class Moving(NamedTuple):
@@ -97,14 +97,10 @@ class Walk:
         primitive, params = equation.primitive, equation.params
         if not any(moves(value) for value in values):
             return evaluate(primitive, values, params)
+        rule = self._rules.get(name_of(equation))
         inner = wrapped_program(equation)
-        named = self._rules.get(f"jit {params.get('name')}")
-        # (A derivative of what has a name keeps it, and has more inputs or outputs.)
-        if named is not None and len(values) == len(equation.outvars) == 1:
-            return named(values, dict(params, walk=self, primitive=primitive))
-        if inner is not None:
+        if rule is None and inner is not None:
             return self.open(*inner, values)
-        rule = self._rules.get(primitive.name)
         try:
             if rule is None:
                 raise NoRule

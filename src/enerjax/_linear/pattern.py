@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array
 from scipy.sparse import csr_array
 
-from .._tracing import evaluate, interpret, is_known, wrapped_program
+from .._tracing import evaluate, interpret, is_known, name_of, wrapped_program
 from .dependence import Constant, Dense, Depends, everything, RULES, Value
 
 
@@ -56,12 +56,11 @@ def _identity(size: int) -> csr_array:
 def _equation(equation: Any, values: list[Value], of_values: bool) -> list[Value]:
     primitive, params = equation.primitive, equation.params
     avals = [var.aval for var in equation.outvars]
-    # (A derivative of what has a name keeps it, and has more inputs or outputs.)
-    named = RULES.get(f"jit {params.get('name')}") if len(values + avals) == 2 else None
+    rule = RULES.get(name_of(equation))
     inner = wrapped_program(equation)
-    if named is None and inner is not None:
-        rule = functools.partial(_equation, of_values=of_values)
-        return interpret(*inner, values, rule)
+    if rule is None and inner is not None:
+        within = functools.partial(_equation, of_values=of_values)
+        return interpret(*inner, values, within)
     if not any(isinstance(v, Depends) for v in values):
         if any(isinstance(v, Constant) for v in values) or primitive.name in _LOOPS:
             return list(map(Constant, avals))
@@ -70,8 +69,7 @@ def _equation(equation: Any, values: list[Value], of_values: bool) -> list[Value
     smooth = any(jnp.issubdtype(aval.dtype, jnp.inexact) for aval in avals)
     if not of_values and (not smooth or primitive.name in _ZERO):
         return list(map(Constant, avals))
-    rule = named or RULES.get(primitive.name, everything)
-    rows = rule(primitive, values, params, avals)
+    rows = (rule or everything)(primitive, values, params, avals)
     return [Depends(r, aval) for r, aval in zip(rows, avals, strict=True)]
 
 

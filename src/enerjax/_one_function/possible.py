@@ -17,7 +17,7 @@ _THIN = 8
 
 _CALLS = """
     closed_call jit remat2 custom_jvp_call custom_vjp_call custom_vmap_call while cond scan
-    xla_metadata_value enerjax_one_function optimization_barrier
+    xla_metadata_value optimization_barrier
 """
 _MOVES = """
     broadcast_in_dim concatenate copy dynamic_slice dynamic_update_slice gather iota pad
@@ -32,6 +32,8 @@ _ELEMENTWISE = """
     shift_right_logical sign sin sinh sqrt square sub tan tanh xor
 """
 _SUMS = "argmax argmin reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum"
+# Of a program in one function, which is one only where it can be.
+NAME = "enerjax_one_function"
 POSSIBLE = frozenset((_CALLS + _MOVES + _ELEMENTWISE).split())
 POSSIBLE_IF_SMALL = frozenset(_SUMS.split())
 
@@ -42,9 +44,9 @@ def is_possible(jaxpr: Jaxpr, besides: Collection[str] = ()) -> bool:
         return False
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
-        if name in besides:
-            possible = True
-        elif name in POSSIBLE_IF_SMALL:
+        if name in besides or name == NAME:
+            continue
+        if name in POSSIBLE_IF_SMALL:
             possible = all(x.aval.size <= LARGEST_SUM for x in eqn.invars)  # pyright: ignore
         elif name == "dot_general":
             possible = is_small_product(eqn)

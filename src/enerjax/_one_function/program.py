@@ -13,7 +13,7 @@ from jax.interpreters.partial_eval import dce_jaxpr_consts
 from jaxtyping import Array, PyTree
 
 from .marks import marked
-from .possible import is_possible
+from .possible import is_possible, NAME
 from .rewriting import as_index, REWRITTEN, rewritten
 
 
@@ -37,39 +37,39 @@ class _Program:
         self.jaxpr = jaxpr
         self.known = known
         self.linear = linear
-        # What is run instead, and what is put into it. (Derivatives are of the program.)
-        self._fixed = [None] * len(known) if is_possible(jaxpr) else known
-        self._run = None
+        # What is run instead (derivatives are of the program itself), what it takes first,
+        # and which of the inputs it does not take.
+        self._words, self._consts, self._fixed = None, [], [None] * len(known)
+        if is_possible(jaxpr):
+            self._words = jaxpr
+        elif is_possible(jaxpr, besides=REWRITTEN):
+            words = rewritten(jaxpr, known)
+            if is_possible(words.jaxpr):
+                self._words, self._consts, self._fixed = words.jaxpr, words.consts, known
         # What is evaluated by itself is compiled once.
         self.compiled = jax.jit(lambda *numbers: self.run(numbers))
-        if is_possible(jaxpr, besides=REWRITTEN):
-            run = rewritten(jaxpr, self._fixed)
-            self._run = run if run.in_avals and is_possible(run.jaxpr) else None
 
     @property
     def is_possible(self) -> bool:
         """Whether it can be one function."""
-        return self._run is not None
+        return self._words is not None and any(x is None for x in self._fixed)
 
     def run(self, numbers: Sequence[Array]) -> list[Array]:
         """What it returns, from one function."""
-        assert self._run is not None
-        jaxpr, consts = self._run.jaxpr, list(map(jnp.asarray, self._run.consts))
         pairs = zip(numbers, self._fixed, strict=True)
-        inputs = [*consts, *(x for x, fixed in pairs if fixed is None)]
-
-        def program(inputs: Sequence[Array]) -> list[Array]:
-            closed = ClosedJaxpr(jaxpr, list(inputs[: len(consts)]))
-            return jaxpr_as_fun(closed)(*inputs[len(consts) :])
-
-        return marked(program, inputs)
+        left = (x for x, fixed in pairs if fixed is None)
+        inputs = [*map(jnp.asarray, self._consts), *left]
+        return marked(functools.partial(_values, self._words), inputs)
 
     def __call__(self, numbers: Sequence[Array]) -> list[Array]:
         pairs = zip(numbers, self.known, strict=True)
-        values = [x if known is None else known for x, known in pairs]
-        count = len(self.jaxpr.constvars)
-        closed = ClosedJaxpr(self.jaxpr, values[:count])
-        return jaxpr_as_fun(closed)(*values[count:])
+        return _values(self.jaxpr, [x if known is None else known for x, known in pairs])
+
+
+def _values(jaxpr: Any, numbers: Sequence[Any]) -> list[Array]:
+    """What a program returns, whose constants come first among the numbers."""
+    count = len(jaxpr.constvars)
+    return jaxpr_as_fun(ClosedJaxpr(jaxpr, list(numbers[:count])))(*numbers[count:])
 
 
 def _run(
@@ -99,7 +99,7 @@ def _run(
     return _merged(made, out, [given[id(x)] if on else None for x, on in pairs])
 
 
-ONE_FUNCTION = Primitive("enerjax_one_function")
+ONE_FUNCTION = Primitive(NAME)
 ONE_FUNCTION.multiple_results = True
 
 

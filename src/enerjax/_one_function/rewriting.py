@@ -17,7 +17,7 @@ from jax.extend.core import ClosedJaxpr, Literal
 from jaxtyping import Array, Int
 
 from .._tracing import evaluate, interpret, programs_within, wrapped_program
-from .possible import is_small_product, LARGEST_SUM
+from .possible import is_small_product, LARGEST_SUM, NAME
 from .products import written_out
 
 
@@ -83,6 +83,7 @@ def _has_fault(jaxpr: Any) -> bool:
     return any(
         _is_at_fault(eqn) or any(map(_has_fault, programs_within(eqn)))
         for eqn in jaxpr.eqns
+        if eqn.primitive.name != NAME
     )
 
 

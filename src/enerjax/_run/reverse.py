@@ -38,31 +38,30 @@ def keep_roots(fn: Body) -> Body:
 
 def scans(rows: int, steps: int) -> tuple[Scan, Scan]:
     """The loops over the rows of a run, and over the steps of a row."""
-    segment = math.isqrt(rows * steps)
-    keep = _checkpoint if rows * steps > LONG else lambda fn: fn
+    total = rows * steps
+    segment = math.isqrt(total)
     # One of both loops is cut: a segment is a group of rows, or a part of one.
     if steps > segment:
-        return jax.lax.scan, functools.partial(_in_segments, keep, segment)
-    return functools.partial(_in_segments, keep, segment // steps), jax.lax.scan
+        return jax.lax.scan, functools.partial(_in_segments, total, segment)
+    return functools.partial(_in_segments, total, segment // steps), jax.lax.scan
 
 
 def scan_until(done: Callable[[Any], Array], length: int) -> Scan:
     """A loop of at most `length` steps, over once `done(carry)`: what is left of its
     segments costs nothing then, and what it hands out there is zero. In a batch the last
     lane decides."""
-    keep = _checkpoint if length > LONG else lambda fn: fn
-    return functools.partial(_in_segments, keep, math.isqrt(length), done=done)
+    return functools.partial(_in_segments, length, math.isqrt(length), done=done)
 
 
 def _in_segments(
-    keep: Callable[[Body], Body],
+    total: int,
     about: int,
     body: Body,
     carry: Any,
     live: Bool[Array, " length"],
     done: Callable[[Any], Array] | None = None,
 ) -> tuple[Any, Any]:
-    """A scan over `live`, whose segments are checkpointed.
+    """A scan over `live` in segments of about so many turns, of a run of `total` steps.
 
     Where segments of no suitable length fill the run, turns that are not live are added. A
     segment of a small system is one function of machine code.
@@ -71,7 +70,9 @@ def _in_segments(
     size = min(range((about + 1) // 2, 2 * about + 1), key=lambda size: -length % size)
     live = jnp.append(live, jnp.zeros((-length % size,), bool)).reshape(-1, size)
     whole = keep_roots(lambda carry, live: jax.lax.scan(body, carry, live))
-    segment = keep(in_one_function(whole))
+    segment = in_one_function(whole)
+    if total > LONG:
+        segment = _checkpoint(segment)
     if done is not None:
         segment = _unless(done, segment)
     carry, out = jax.lax.scan(segment, carry, live)
