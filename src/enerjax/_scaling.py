@@ -44,7 +44,7 @@ def scales_like(
         rate = unit / scales.coordinate
         momentum = (unit * scales.coordinate)[: x.momentum.size]
         impulse = (unit / scales.constraint)[: x.impulse.size]
-        return Increment(rate, momentum, impulse, unit / joint)
+        return Increment(impulse, rate, momentum, unit / joint)
 
     def row(x):
         if not is_increment(x):
@@ -56,7 +56,7 @@ def scales_like(
         # Those of the momenta not much beyond the round-off of the terms of the forces.
         momentum = jnp.maximum(root * scales.coordinate, _BEYOND * forces)
         rate = (root / scales.coordinate)[: x.momentum.size]
-        return Increment(momentum, rate, position[: x.impulse.size], root * joint)
+        return Increment(position[: x.impulse.size], momentum, rate, root * joint)
 
     unknowns, rows = (jax.tree.map(f, z, is_leaf=is_increment) for f in (unknown, row))
     return unknowns, rows, jnp.clip(least / root, small, 1.0)

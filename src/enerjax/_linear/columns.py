@@ -8,7 +8,6 @@ not computed with respect to multipliers too.
 """
 
 import functools
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -20,6 +19,7 @@ from jaxtyping import Array, Float
 
 from .._one_function import LARGEST_SUM
 from .._tracing import evaluate, interpret
+from .filled import ELEMENTWISE, ends, filled_after, moved
 from .moves import MOVES
 
 
@@ -30,7 +30,8 @@ def columns_along(
     program = jax.make_jaxpr(jax.linearize(fn, x)[1])(x)
     seeds = seeds.astype(x.dtype)
     rule = functools.partial(_equation, count=seeds.shape[1])
-    (out,) = interpret(program.jaxpr, program.consts, [_trimmed(seeds)], rule)
+    first = _known(seeds, range(seeds.shape[1]), seeds.shape[1])
+    (out,) = interpret(program.jaxpr, program.consts, [first], rule)
     return _in_columns(out, range(seeds.shape[1]))
 
 
@@ -44,22 +45,37 @@ def jacobian_columns(
 class _Columns:
     """An array with an axis more, the last one, in which its columns follow each other.
 
-    `numbers` are those of the columns that it has; in the others it is zero. An array of
-    NumPy is known while the program is traced.
+    - `numbers`: of the columns that it has; in the others it is zero. An array of NumPy is
+      known while the program is traced.
+    - `filled`: which entries can differ from zero in which of all columns; `None` where
+      there are too many to ask.
     """
 
-    def __init__(self, array: Array | np.ndarray, numbers: range):
+    def __init__(
+        self, array: Array | np.ndarray, numbers: range, filled: np.ndarray | None
+    ):
         self.array = array
         self.numbers = numbers
+        self.filled = filled
 
 
-def _trimmed(array: np.ndarray, first: int = 0) -> _Columns:
-    """Without zero columns at both ends."""
-    filled = np.flatnonzero(np.any(array != 0, axis=tuple(range(array.ndim - 1))))
-    if filled.size == 0:
-        return _Columns(array[..., :0], range(0))
-    start, stop = int(filled[0]), int(filled[-1]) + 1
-    return _Columns(array[..., start:stop], range(first + start, first + stop))
+def _trimmed(
+    array: Array | np.ndarray, numbers: range, filled: np.ndarray | None
+) -> _Columns:
+    """Without columns at both ends that are zero."""
+    if filled is None:
+        return _Columns(array, numbers, None)
+    own = ends(filled)
+    if own != numbers:
+        start = own.start - numbers.start
+        array = array[..., start : start + len(own)] if own else array[..., :0]
+    return _Columns(array, own, filled)
+
+
+def _known(array: np.ndarray, numbers: range, count: int) -> _Columns:
+    filled = np.zeros((*array.shape[:-1], count), bool)
+    filled[..., numbers.start : numbers.stop] = array != 0
+    return _trimmed(array, numbers, filled)
 
 
 def _in_columns(value: "Array | _Columns", numbers: range) -> Array:
@@ -70,8 +86,9 @@ def _in_columns(value: "Array | _Columns", numbers: range) -> Array:
     array, own = jnp.asarray(value.array), value.numbers
     if own == numbers:
         return array
-    if not own:
+    if not range(max(own.start, numbers.start), min(own.stop, numbers.stop)):
         return jnp.zeros((*array.shape[:-1], len(numbers)), array.dtype)
+    # (Padding below zero takes columns away.)
     before, after = own.start - numbers.start, numbers.stop - own.stop
     config = (*((0, 0, 0) for _ in array.shape[:-1]), (before, after, 0))
     return lax.pad(array, jnp.zeros((), array.dtype), config)
@@ -87,8 +104,6 @@ def _hull(values: list[Any]) -> range:
 
 # Parts in which a large sum is taken.
 _PARTS = 8
-# What is left of arithmetic in a tangent.
-_ELEMENTWISE = frozenset("add add_any convert_element_type copy div mul neg sub".split())
 
 
 def _broadcast(x, k, *, shape, broadcast_dimensions, **_):
@@ -146,13 +161,21 @@ def _equation(equation: Any, values: list[Any], count: int) -> list[Any]:
         inner = params["jaxpr"]
         rule = functools.partial(_equation, count=count)
         return interpret(inner.jaxpr, inner.consts, values, rule)
-    first = values[0]
-    if name in MOVES and len(values) == 1 and isinstance(first.array, np.ndarray):
-        return _known_move(first, MOVES[name], params)
     # All is linear, unless a rule asks whether a tangent is zero.
     is_linear = all(jnp.issubdtype(x.aval.dtype, jnp.inexact) for x in equation.outvars)
     numbers = _hull(values) if is_linear else range(count)
-    if name in _ELEMENTWISE:
+    masks = [x.filled if isinstance(x, _Columns) else False for x in values]
+    filled = filled_after(equation, masks, count) if is_linear else None
+    first = values[0]
+    if name in MOVES and len(values) == 1 and isinstance(first.array, np.ndarray):
+        # Of the seeds, before the arithmetic begins.
+        out = moved(MOVES[name], [first.array], params)
+        return [_known(x, first.numbers, count) for x in out]
+    if filled is not None and len(filled) == 1:
+        numbers = ends(filled[0])
+    if not numbers:
+        out = [jnp.zeros((*x.aval.shape, 0), x.aval.dtype) for x in equation.outvars]
+    elif name in ELEMENTWISE:
         arrays = [_in_columns(x, numbers) for x in values]
         shape = jnp.broadcast_shapes(*(x.shape for x in arrays))
         out = evaluate(primitive, [jnp.broadcast_to(x, shape) for x in arrays], params)
@@ -167,16 +190,8 @@ def _equation(equation: Any, values: list[Any], count: int) -> list[Any]:
         out = [lax.pad(_in_columns(first, numbers), jnp.asarray(values[1]), config)]
     else:
         out = _by_vmap(primitive, values, params, numbers)
-    return [_Columns(x, numbers) for x in out]
-
-
-def _known_move(value: _Columns, move: Callable, params: dict[str, Any]) -> list[_Columns]:
-    """Of the seeds, before the arithmetic begins: they show which columns are zero."""
-    shape = value.array.shape[:-1]
-    places = np.arange(math.prod(shape))
-    rows = np.reshape(value.array, (places.size, len(value.numbers)))
-    outs = move(places.reshape(shape), **params)
-    return [_trimmed(rows[out], value.numbers.start) for out in outs]
+    filled = [None] * len(out) if filled is None else filled
+    return [_trimmed(x, numbers, own) for x, own in zip(out, filled, strict=True)]
 
 
 def _by_vmap(

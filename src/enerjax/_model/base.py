@@ -181,10 +181,10 @@ class AbstractModel(eqx.Module):
         def parts(x: Array) -> tuple[Array, Array]:
             return jnp.concatenate([x[:first], x[last:]]), x[first:last]
 
-        impulses, etas = parts(increment.impulse), parts(increment.velocity_impulse)
-        rate, momentum = increment.rate, increment.momentum
-        fixed, driven = zip(impulses, etas, strict=True)
-        return Increment(rate, momentum, *fixed), Increment(rate, momentum, *driven)
+        multipliers = lambda z: (z.impulse, z.velocity_impulse)
+        fixed, driven = zip(*map(parts, multipliers(increment)), strict=True)
+        with_those = lambda some: eqx.tree_at(multipliers, increment, some)
+        return with_those(fixed), with_those(driven)
 
     def driven_action(
         self, q: Coordinates, rate: Coordinates, t: Time, h: Scalar, driven: Increment

@@ -23,19 +23,20 @@ class Increment(eqx.Module):
 
     | field | as unknown | as row |
     |---|---|---|
+    | `impulse` | `h lambda` | `Phi(q)/h` |
     | `rate` | `(q - q0)/h` | balance of momentum, `S_q` |
     | `momentum` | `p`; empty where velocities are eliminated | `S_mu/h` |
-    | `impulse` | `h lambda` | `Phi(q)/h` |
     | `velocity_impulse` | `eta` | `psi(q, v)`; empty for index 3 |
 
     The rate and not `q` is the unknown: the rounding of `q`, divided by `h`, would
     otherwise enter the velocities. Each unknown and its row have reciprocal units, so
-    one set of `Scales` serves both.
+    one set of `Scales` serves both. The order puts those together that velocities depend
+    on: Jacobians are found for neighbouring unknowns at a time.
     """
 
+    impulse: Multipliers
     rate: Coordinates
     momentum: Float[Array, " np"]
-    impulse: Multipliers
     velocity_impulse: JointMultipliers
 
 

@@ -66,8 +66,8 @@ def balance_rows(
 ) -> Increment:
     """A balance of momentum, and the constraints at the end of the step."""
     return Increment(
+        problem.model.constraint(end.q, end.t) / problem.h,
         impulse,
         z.momentum,
-        problem.model.constraint(end.q, end.t) / problem.h,
         problem.joint_rate(end),
     )

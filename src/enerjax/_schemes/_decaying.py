@@ -65,7 +65,8 @@ def predict_jump_and_end(
     start, lift = problem.start, lambda v: problem.model.lift(problem.start.q, v)
     _, rate = jax.jvp(lift, (start.v,), (-problem.h / 6 * acceleration,))
     momentum = start.v[: end.momentum.size]
-    return JumpAndEnd(Increment(rate, momentum, end.impulse, end.velocity_impulse), end)
+    moved = lambda z: (z.rate, z.momentum)
+    return JumpAndEnd(eqx.tree_at(moved, end, (rate, momentum)), end)
 
 
 def split_velocities(

@@ -112,9 +112,9 @@ class StepProblem(eqx.Module):
         """
         structure = self.model.structure(self.start, node, self.h, z.rate, drive)
         return Increment(
+            self.model.constraint(node.q, node.t) / self.h,
             structure.impulse,
             structure.drift,
-            self.model.constraint(node.q, node.t) / self.h,
             self.joint_rate(node if moving is None else moving),
         )
 
@@ -124,9 +124,9 @@ class StepProblem(eqx.Module):
         momentum = v + h * acceleration
         num_rates = jax.eval_shape(self.joint_rate, self.start).size
         return Increment(
+            h * multipliers,
             self.model.lift(q, v + 0.5 * h * acceleration),
             momentum if self.model.has_own_momenta else momentum[:0],
-            h * multipliers,
             jnp.zeros((num_rates,), q.dtype),
         )
 

@@ -124,7 +124,7 @@ class EnergyConsistent(AbstractSingleSolve[_Unknowns, Frozen]):
         if not isinstance(problem.stiffness, Assembled):
             return guess
         none = guess.momentum
-        return JumpAndEnd(Increment(jnp.zeros_like(guess.rate), none, none, none), guess)
+        return JumpAndEnd(Increment(none, jnp.zeros_like(guess.rate), none, none), guess)
 
     def residual(self, z: _Unknowns, problem: Frozen) -> _Unknowns:
         if not isinstance(z, JumpAndEnd):

@@ -189,9 +189,7 @@ def _eta(increment: Increment) -> JointMultipliers:
 
 def _position_level(increment: Increment) -> Increment:
     """Without the velocity-level multipliers: in this scheme they drive no momentum."""
-    return Increment(
-        increment.rate, increment.momentum, increment.impulse, _eta(increment)[:0]
-    )
+    return eqx.tree_at(_eta, increment, _eta(increment)[:0])
 
 
 def _scaled(kappa: Scalar, drive: Drive) -> Drive:

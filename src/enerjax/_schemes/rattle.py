@@ -1,3 +1,5 @@
+import equinox as eqx
+
 from .._model import AbstractModel, Increment
 from .._results import RESULTS
 from .._system import State
@@ -57,7 +59,7 @@ class Rattle(AbstractSingleSolve[Increment, StepProblem]):
     ) -> Increment:
         """The velocity half-way, `h lambda0` and, as velocity impulse, `h lambda1`."""
         guess = problem.guess(acceleration, multipliers)
-        return Increment(guess.rate, guess.momentum, guess.impulse, guess.impulse)
+        return eqx.tree_at(lambda z: z.velocity_impulse, guess, guess.impulse)
 
     def residual(self, z: Increment, problem: StepProblem) -> Increment:
         start, middle = problem.start, z.rate
