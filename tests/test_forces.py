@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 import enerjax as ej
 
-from .helpers import follow, slopes
+from .helpers import EPS, follow, slopes
 
 
 SCHEMES = {
@@ -241,8 +241,8 @@ def test_a_torque_acts_in_body_axes(scheme):
     )
     np.testing.assert_allclose(slopes(found), 2, atol=0.1)
     assert found[-1] <= 5e-4
-    # Solver, against an energy of 25.
-    assert leak <= 1e-13
+    # Round-off, against an energy of 25: a random walk of a hundred steps.
+    assert leak <= 4 * np.sqrt(100) * EPS * 25
     still = BODY_ARGS | dict(motor=jnp.zeros(3))
     _, _, most = follow(BODY, SCHEMES[scheme], start, still, h=0.5, steps=20)
     assert most < 0

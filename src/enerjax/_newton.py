@@ -19,15 +19,16 @@ def max_norm(x: PyTree[Array]) -> Scalar:
 class Newton(eqx.Module):
     """Newton's method on a problem scaled to order one, down to round-off.
 
-    One Jacobian serves several corrections, with an approximate inverse that is improved
-    from that of the step before. It is renewed where the corrections `c_k` would shrink by
-    less than three; such a correction is not made. Where the first one after that of a new
-    Jacobian is larger still, that went too far: it is halved, up to seven times (P.
-    Deuflhard's natural monotonicity test). Stops after a correction whose error,
-    predicted to be `c_k max(c_k / c_{k-1}, c_{k-1})`, is of round-off size, or which was
-    computed from a residual that is, or where corrections that did shrink no longer do:
-    coordinates far from the origin are too coarse for more. An iteration that breaks
-    down, or has not converged with 12 Jacobians, begins again from a second guess.
+    One Jacobian serves several corrections, with an approximate inverse that is
+    extrapolated from those of the steps before, and improved. It is renewed where the
+    corrections `c_k` would shrink by less than three; such a correction is not made. Where
+    the first one after that of a new Jacobian is larger still, that went too far: it is
+    halved, up to seven times (P. Deuflhard's natural monotonicity test). Stops after a
+    correction whose error, predicted to be `c_k max(c_k / c_{k-1}, c_{k-1})`, is of
+    round-off size, or which was computed from a residual that is, or where corrections that
+    did shrink no longer do: coordinates far from the origin are too coarse for more. An
+    iteration that breaks down, or has not converged with 12 Jacobians, begins again from a
+    second guess.
 
     **Arguments:**
 
@@ -100,9 +101,9 @@ class _Iterate(eqx.Module):
 # Jacobians after which a first guess is given up. Where quadratic convergence sets in at
 # all, it does so before.
 PATIENCE = 12
-# What a correction may leave of the one before, for its Jacobian to serve on. That of the
-# step before is not used: it leaves an error of round-off size, but of one sign, and the
-# energy would drift.
+# What a correction may leave of the one before, for its Jacobian to serve on. What steps
+# before have left is never used as it is, near as it can be: it is blind to what has become
+# soft since, and a light body hides behind a heavy one until corrections are exact.
 _SHRINKS = 0.3
 _STALLS = 4
 # A correction is halved until it takes no part smaller than this.

@@ -39,7 +39,7 @@ class Memory(eqx.Module):
     - `added`: what the last three steps added to a free flight, newest first.
     - `is_smooth`: whether extrapolating from these would have met the last step better
       than repeating.
-    - `factors`: of the Jacobian of the last step.
+    - `factors`: of the Jacobians of the last three steps, newest first.
     - `carried`: what a scheme with a memory hands on; of others `None`.
     """
 
@@ -86,6 +86,7 @@ def first_memory(
     added = jax.lax.stop_gradient(added)
     flat, _ = ravel_pytree(flight)
     factors = kept_factors(flat.size, flat.dtype)
+    factors = jax.tree.map(lambda x: jnp.stack([x] * 3), factors)
     return Memory(added, jnp.array(True), factors, carried)
 
 
@@ -133,7 +134,7 @@ def solve(
 
     # Smooth motion is met by extrapolation; where it changes quickly the last step is
     # the better guess. What would have been better for the step before decides.
-    smooth = jax.tree.map(lambda x: 3 * x[0] - 3 * x[1] + x[2], memory.added)
+    smooth = jax.tree.map(_next, memory.added)
     last = jax.tree.map(lambda x: x[0], memory.added)
     choose = lambda x, y: jnp.where(memory.is_smooth, x, y)
     added = jax.tree.map(choose, smooth, last)
@@ -151,7 +152,7 @@ def solve(
         least=least,
         simplified=simplified if isinstance(scheme, AbstractSimplifiedSolve) else None,
     )
-    root = find(guess=guess, factors=memory.factors, skip=skip)
+    root = find(guess=guess, factors=jax.tree.map(_next, memory.factors), skip=skip)
     if model.system.redundant:
         # Again, from where constraints that repeat each other agree, and without forces:
         # what is left open of these by the equations stays zero.
@@ -181,14 +182,22 @@ def solve(
         jax.tree.map(lambda x, y, unit: (x - y) / unit, added, x, unknown_scale)
     )
     memory = Memory(
-        jax.tree.map(
-            lambda new, old: jnp.stack([new, old[0], old[1]]), added, memory.added
-        ),
+        jax.tree.map(_pushed, added, memory.added),
         off(smooth) <= off(last),
-        root.factors,
+        jax.tree.map(_pushed, root.factors, memory.factors),
         end.carried,
     )
     return Solved(end, root.iterations, root.residual, result, memory)
+
+
+def _next(x: Array) -> Array:
+    """What follows the last three, newest first, on a parabola."""
+    return 3 * x[0] - 3 * x[1] + x[2]
+
+
+def _pushed(new: Array, old: Array) -> Array:
+    """The last three, one step later."""
+    return jnp.stack([new, old[0], old[1]])
 
 
 def _turns(model: AbstractModel, a: State, b: State) -> Flag:

@@ -105,54 +105,53 @@ class AbstractFactors(eqx.Module):
 class Inverse(AbstractFactors):
     """An approximate inverse, which a chord iteration makes good.
 
-    Renewed by the iteration of G. Schulz (1933), `X (1 + E + E^2)` with `E = 1 - A X`,
-    which leaves `E^3`; computed afresh where the old one is too far off. Of the matrix with
-    rows of size one: others would make `E` look larger than it is.
+    Renewed by the iteration of G. Schulz (1933), `X (1 + E)` with `E = 1 - A X`, which
+    leaves `E^2`; computed afresh where the old one is too far off. Of the matrix with rows
+    of size one: others would make `E` look larger than it is.
     """
 
     inverse: Float[Array, "n n"]
-    sizes: Float[Array, " n"]
 
     @classmethod
     def empty(cls, size: int, dtype: Any) -> "Inverse":
         """Of no matrix yet: corrects nothing, and is renewed."""
-        nothing = jnp.full((size, size), jnp.nan, dtype)
-        return cls(nothing, nothing[0])
+        return cls(jnp.full((size, size), jnp.nan, dtype))
 
     def renewed(self, matrix: Float[Array, "n n"]) -> "Inverse":
         sizes = jnp.max(jnp.abs(matrix), axis=1)
         matrix = matrix / sizes[:, None]
 
-        def improved(x, e, size):
-            """The next inverse, its error `e^3` in factors, and a bound on its size."""
-            square, both, part = unmerged(_square)(e)
-            return x + product(x, both), (e, square), size * part
-
+        # Of carries: an inverse, the error that it had before it was improved, as a matrix,
+        # and a bound on the size of what that has left.
         def is_rough(carry) -> Flag:
-            _, _, size = carry
-            return (size > _ENOUGH) & (size < _FAR)
+            _, _, left = carry
+            return (left > _ENOUGH) & (left < _FAR)
 
         def turn(carry):
-            x, error, size = carry
-            return improved(x, product(*error), size)
+            x, error, _ = carry
+            error, size = unmerged(_square)(error)
+            return x + product(x, error), error, size * size
 
         def is_lost(carry) -> Flag:
-            _, _, size = carry
-            return ~(size < _FAR)
+            _, _, left = carry
+            return ~(left < _FAR)
 
         def start_again(carry):
-            _, error, size = carry
+            _, error, left = carry
             # By a one that XLA cannot see: it would move what does not change in a loop out
             # of it, and eliminate in every step.
-            one = jnp.where(size < _FAR, 0, jnp.ones_like(size))
-            return inverse(one * matrix), error, jnp.zeros_like(size)
+            one = jnp.where(left < _FAR, 0, jnp.ones_like(left))
+            return inverse(one * matrix), error, jnp.zeros_like(left)
 
-        carry = improved(self.inverse, *unmerged(_defect)(matrix, self.inverse))
+        x = self.inverse * sizes[None]
+        error, size = unmerged(_defect)(matrix, x)
+        carry = x + product(x, error), error, jnp.where(size < _FAR, size * size, size)
         carry = jax.lax.while_loop(is_rough, turn, carry)
-        return Inverse(jax.lax.while_loop(is_lost, start_again, carry)[0], sizes)
+        x, _, _ = jax.lax.while_loop(is_lost, start_again, carry)
+        return Inverse(x / sizes[None])
 
     def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
-        return self.inverse @ (right / self.sizes)
+        return self.inverse @ right
 
 
 class LU(AbstractFactors):
@@ -186,7 +185,7 @@ def solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array
 
 # Errors of an inverse beyond which it is computed afresh, and which are small enough for a
 # chord iteration to gain as many digits at a time.
-_FAR = 0.5
+_FAR = 0.3
 _ENOUGH = 1e-7
 
 
@@ -206,10 +205,10 @@ def _defect(matrix: Array, inverse: Array) -> tuple[Array, Scalar]:
     return defect, _row_sum(defect)
 
 
-def _square(e: Float[Array, "n n"]) -> tuple[Array, Array, Scalar]:
-    """`e^2`, `e + e^2` and the size of the first."""
+def _square(e: Float[Array, "n n"]) -> tuple[Array, Scalar]:
+    """`e^2` and its size."""
     square = product(e, e)
-    return square, e + square, _row_sum(square)
+    return square, _row_sum(square)
 
 
 def _row_sum(matrix: Float[Array, "n n"]) -> Scalar:

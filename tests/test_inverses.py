@@ -1,0 +1,53 @@
+"""Approximate inverses, improved from one step to the next."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import enerjax as ej
+from enerjax._linear.dense import Inverse
+
+from .helpers import EPS
+
+
+SIZE = 6
+TURN = np.sin(np.arange(1.0, 1 + SIZE**2)).reshape(SIZE, SIZE)
+# Rows of very different size, as those of multipliers and momenta are.
+ROWS = 10.0 ** np.arange(-3, 3)[:, None]
+
+
+def matrix(t):
+    return jnp.asarray(ROWS * (3 * np.eye(SIZE) + np.sin(t) * TURN))
+
+
+@pytest.mark.parametrize("off", [1e-6, 1e-3, 0.02, 0.2, 2.0])
+def test_renewed_from_near_and_from_far(off):
+    """By improvements, or computed afresh."""
+    old = Inverse(jnp.linalg.inv(matrix(0.0)))
+    new = jax.jit(lambda at: old.renewed(at))(matrix(off))
+    left = np.asarray(matrix(off) @ new.inverse) / ROWS * ROWS.T - np.eye(SIZE)
+    # Truncation: errors of 1e-7 are small enough for a chord iteration.
+    assert np.max(np.abs(left)) < 1e-7
+
+
+def test_a_singular_matrix_has_no_inverse():
+    old = Inverse(jnp.eye(2))
+    assert not np.any(np.isfinite(old.renewed(jnp.ones((2, 2))).inverse))
+
+
+@pytest.mark.parametrize(("brake", "load"), [(1e10, 1e-6), (1e10, 1e-13), (1e8, 1e-8)])
+def test_what_becomes_soft_is_seen(brake, load):
+    """A body whose brake is released: inverses of before do not see what is left of its
+    equation, while the corrections of another body shrink as they should."""
+
+    def force(q, v, t, args):
+        return jnp.stack([0.0 * t, jnp.where(t < 1, -args["c"] * v[1], args["w"])])
+
+    system = ej.System(lambda v, _: 0.5 * v @ v, lambda q, _: 0.5 * q[0] ** 2, force=force)
+    start = ej.State(jnp.array([1.0, 0.0]), jnp.zeros(2))
+    args = {"c": brake, "w": load}
+    sol = ej.simulate(system, ej.EnergyPreserving(), start, args, h=1e-2, num_steps=300)
+    # Round-off, and what the brake lets pass until then.
+    atol = 300 * EPS * load + 2 * load / brake
+    assert float(sol.end.v[1]) == pytest.approx(2 * load, rel=0, abs=atol)
