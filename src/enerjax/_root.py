@@ -5,7 +5,7 @@ order one, and finds its root, by default with `Newton`. Derivatives of the root
 from the implicit function theorem, in forward and in reverse mode.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import equinox as eqx
@@ -105,7 +105,8 @@ def _search(
         near = narrowed(exact, flat_simplified, flat, args)
     if near is None:
         return _iterated(exact, root_finder, start, max_iterations)
-    first = _iterated(near, root_finder, start, min(PATIENCE, max_iterations))
+    alone = eqx.tree_at(lambda start: start.others, start, ())
+    first = _iterated(near, root_finder, alone, PATIENCE)
 
     def again() -> Root:
         # (The lanes of a batch all come here.)
@@ -174,7 +175,7 @@ def find_root(
     args: PyTree,
     *,
     max_iterations: int,
-    second_guess: PyTree[Array] | None = None,
+    others: Sequence[PyTree[Array]] = (),
     factors: AbstractFactors | None = None,
     skip: Flag | bool = False,
     fill: PyTree[Array] | None = None,
@@ -185,8 +186,8 @@ def find_root(
 
     The implicit function theorem gives its derivatives with respect to `args`, with one
     linear solve each; a singular lane of a batch has non-finite derivatives of its own and
-    leaves the others alone. `guess`, `factors` (of a solve before) and `second_guess` only
-    say where to begin. With `skip`, `Newton` returns the guess without an iteration.
+    leaves the others alone. `guess`, `factors` (of a solve before) and `others`, guesses that
+    `Newton` turns to where it fails, only say where to begin. With `skip`, `Newton` returns the guess without an iteration.
 
     `fill`, like the guess, is for equations that do not determine some of the unknowns,
     and do not ask for them either: small numbers that are added to the diagonal of the
@@ -201,7 +202,7 @@ def find_root(
     flat, _ = ravel_pytree(guess)
     start = Start(
         guess,
-        guess if second_guess is None else second_guess,
+        tuple(others),
         kept_factors(flat.size, flat.dtype) if factors is None else factors,
         jnp.asarray(skip),
         fill,

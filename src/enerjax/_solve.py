@@ -146,8 +146,12 @@ def solve(
         args=inputs,
         max_iterations=MAX_ITERATIONS,
         # What the last steps suggest can lie beyond a fold of the step equations; the
-        # flight without force starts on the near side.
-        second_guess=jax.tree.map(jnp.divide, flight, unknown_scale),
+        # flight without force starts on the near side, and where a rod would turn far in
+        # such a flight, a part of it.
+        others=[
+            jax.tree.map(jnp.divide, _shortened(flight, part), unknown_scale)
+            for part in (1.0, 0.5, 0.25)
+        ],
         fill=_fill(model, unknown_scale, row_scale),
         least=least,
         simplified=simplified if isinstance(scheme, AbstractSimplifiedSolve) else None,
@@ -239,6 +243,14 @@ def _fill(model: AbstractModel, unknown_scale: Any, row_scale: Any) -> Any | Non
 
     none = jax.tree.map(jnp.zeros_like, unknown_scale)
     return _with_multipliers(none, jax.tree.map(weigh, unknown_scale, row_scale))
+
+
+def _shortened(flight: PyTree[Any], part: float) -> PyTree[Any]:
+    """A free flight that goes a part of the way."""
+    is_increment = lambda x: isinstance(x, Increment)
+    way = lambda x: eqx.tree_at(lambda x: x.rate, x, part * x.rate)
+    change = lambda x: way(x) if is_increment(x) else x
+    return jax.tree.map(change, flight, is_leaf=is_increment)
 
 
 def _free_flight(
