@@ -13,9 +13,9 @@ class RESULTS(eqx.Enumeration):
     successful = ""
     not_converged = (
         "Newton's method did not converge. The step may be too long for the motion: "
-        "reduce `h`, or let steps that fail be divided: `max_halvings=3`. Light masses "
-        "between heavy ones or stiff springs want `EnergyConsistent(1.0)` or "
-        "`EnergyDecaying(1.0)`, which damp what the step cannot resolve."
+        "reduce `h`, or let steps that fail be divided: `max_halvings=4`, or let a "
+        "`StepController` choose the steps. Vibrations of stiff springs that no step can "
+        "resolve are damped by `EnergyConsistent(1.0)` or `EnergyDecaying(1.0)`."
     )
     singular = (
         "The step equations became singular. Constraints may repeat each other (declare "

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
@@ -60,3 +61,11 @@ def scales_like(
 
     unknowns, rows = (jax.tree.map(f, z, is_leaf=is_increment) for f in (unknown, row))
     return unknowns, rows, jnp.clip(least / root, small, 1.0)
+
+
+def shortened(flight: PyTree[Any], part: float) -> PyTree[Any]:
+    """A free flight that goes a part of the way."""
+    is_increment = lambda x: isinstance(x, Increment)
+    way = lambda x: eqx.tree_at(lambda x: x.rate, x, part * x.rate)
+    change = lambda x: way(x) if is_increment(x) else x
+    return jax.tree.map(change, flight, is_leaf=is_increment)

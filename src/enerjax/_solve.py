@@ -18,7 +18,7 @@ from ._model import AbstractModel, Increment
 from ._newton import max_norm
 from ._results import first_failure, from_root_finder, RESULTS
 from ._root import find_root, RootFinder
-from ._scaling import scales_like
+from ._scaling import scales_like, shortened
 from ._schemes import (
     AbstractCarryingSolve,
     AbstractSimplifiedSolve,
@@ -139,19 +139,16 @@ def solve(
     choose = lambda x, y: jnp.where(memory.is_smooth, x, y)
     added = jax.tree.map(choose, smooth, last)
     guess = jax.tree.map(lambda x0, x, s: (x0 + x) / s, flight, added, unknown_scale)
+    scale_down = lambda z: jax.tree.map(jnp.divide, z, unknown_scale)
     find = functools.partial(
         find_root,
         scaled,
         root_finder,
         args=inputs,
         max_iterations=MAX_ITERATIONS,
-        # What the last steps suggest can lie beyond a fold of the step equations; the
-        # flight without force starts on the near side, and where a rod would turn far in
-        # such a flight, a part of it.
-        others=[
-            jax.tree.map(jnp.divide, _shortened(flight, part), unknown_scale)
-            for part in (1.0, 0.5, 0.25)
-        ],
+        # What the last steps suggest can lie beyond a fold of the step equations, a flight
+        # without force on the near side, or where rods turn far in it, a part of that.
+        others=[scale_down(shortened(flight, part)) for part in (1.0, 0.5, 0.25)],
         fill=_fill(model, unknown_scale, row_scale),
         least=least,
         simplified=simplified if isinstance(scheme, AbstractSimplifiedSolve) else None,
@@ -175,7 +172,6 @@ def solve(
         )
     z = jax.tree.map(jnp.multiply, root.value, unknown_scale)
     end = scheme.finish(z, problem)
-    # What the scheme itself can tell of a failed iterate says more than that it failed.
     result = from_root_finder(root.found, root.broken, root.finite)
     turned = RESULTS.where(
         _turns(model, start, end.state), RESULTS.step_too_large, RESULTS.successful
@@ -243,14 +239,6 @@ def _fill(model: AbstractModel, unknown_scale: Any, row_scale: Any) -> Any | Non
 
     none = jax.tree.map(jnp.zeros_like, unknown_scale)
     return _with_multipliers(none, jax.tree.map(weigh, unknown_scale, row_scale))
-
-
-def _shortened(flight: PyTree[Any], part: float) -> PyTree[Any]:
-    """A free flight that goes a part of the way."""
-    is_increment = lambda x: isinstance(x, Increment)
-    way = lambda x: eqx.tree_at(lambda x: x.rate, x, part * x.rate)
-    change = lambda x: way(x) if is_increment(x) else x
-    return jax.tree.map(change, flight, is_leaf=is_increment)
 
 
 def _free_flight(

@@ -1,6 +1,7 @@
 """Traced values and programs: what JAX knows of a function before it runs."""
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -77,6 +78,20 @@ def wrapped_program(equation: Any) -> tuple[Jaxpr, list[Any]] | None:
     if isinstance(program, ClosedJaxpr):
         return program.jaxpr, program.consts
     return program, []
+
+
+def function_with_own_derivative(equation: Any) -> tuple[str, bool] | None:
+    """The name of a function whose derivative is given, and whether JAX itself defines it,
+    where an equation calls one: under `jax.custom_jvp` or `jax.custom_vjp`."""
+    if equation.primitive.name not in ("custom_jvp_call", "custom_vjp_call"):
+        return None
+    program, _ = wrapped_program(equation) or (None, [])
+    info = getattr(program, "debug_info", None)
+    source = getattr(info, "func_src_info", None) or ""
+    return getattr(info, "func_name", None) or "(unnamed)", str(_OF_JAX) in source
+
+
+_OF_JAX = Path(jax.__file__).parent
 
 
 def programs_within(equation: Any) -> Iterator[Jaxpr]:

@@ -11,7 +11,7 @@ from .._types import Coordinates, Scalar
 from .base import AbstractDerivative
 from .fallback import fallback
 from .rules import RULES
-from .transform import increment, Moving, Walk
+from .transform import increment, Moving, Value, Walk
 
 
 def discrete_jvp(
@@ -81,7 +81,9 @@ def discrete_fallbacks(fn: Callable[..., PyTree[Array]]) -> Callable[..., list[s
     """The primitives of `fn` that have no rule, as a function of two points.
 
     For each of them the discrete derivative is that of the corrected mean value, of that
-    primitive alone. Empty where all is exact.
+    primitive alone. So it is for functions with a derivative of their own
+    (`jax.custom_jvp`, `jax.custom_vjp`), which are listed with their names: the derivative
+    that was given is used, and not that of the program inside. Empty where all is exact.
     """
 
     def fallbacks(a: PyTree[Array], b: PyTree[Array], *args: Any) -> list[str]:
@@ -114,9 +116,21 @@ def _traced(
     def push(d: PyTree[Array], walk: Walk) -> PyTree[Array]:
         inputs = list(map(Moving, flat_a, flat_b, structure.flatten_up_to(d)))
         outs = walk.closed(program, inputs)
-        return out_structure.unflatten([increment(x) for x in outs])
+        return out_structure.unflatten([_valid_increment(x) for x in outs])
 
     return push
+
+
+def _valid_increment(value: Value) -> Array:
+    """The increment of an output, which is no number where the function has no value.
+
+    Difference quotients can be finite where the function itself is not defined: that of a
+    logarithm between negative numbers, say.
+    """
+    if not isinstance(value, Moving):
+        return increment(value)
+    valid = jnp.isfinite(value.a) & jnp.isfinite(value.b)
+    return jnp.where(valid, 1, jnp.nan).astype(value.d.dtype) * value.d
 
 
 class ChainRule(AbstractDerivative):

@@ -90,11 +90,14 @@ def logistic(a: Array, b: Array) -> Array:
 
 
 def log(a: Array, b: Array) -> Array:
-    return _log_ratio(b - a, a + b, jnp.log(b) - jnp.log(a))
+    # Where a logarithm is not defined, but its slope is, a selection may ask for the
+    # quotient without choosing the logarithm; that of the modulus has this slope.
+    return _log_ratio(b - a, a + b, jnp.log(jnp.abs(b)) - jnp.log(jnp.abs(a)))
 
 
 def log1p(a: Array, b: Array) -> Array:
-    return _log_ratio(b - a, 2 + a + b, jnp.log1p(b) - jnp.log1p(a))
+    modulus = lambda x: jnp.log1p(jnp.where(x < -1, -2 - x, x))
+    return _log_ratio(b - a, 2 + a + b, modulus(b) - modulus(a))
 
 
 def _log_ratio(d: Array, total: Array, change: Array) -> Array:
@@ -165,9 +168,13 @@ def atan(a: Array, b: Array) -> Array:
 
 def atanh(a: Array, b: Array) -> Array:
     d, total = b - a, 1 - a * b
-    near = jnp.abs(d) < 0.25 * total
+    near = jnp.abs(d) < 0.25 * jnp.abs(total)
     ratio = jnp.where(near, d, 0) / jnp.where(near, total, 1)
-    change = jnp.arctanh(b) - jnp.arctanh(a)
+    # Beyond 1 of the inverse of the coth, which has the same slope.
+    inside = lambda x: jnp.arctanh(
+        jnp.where(jnp.abs(x) > 1, 1 / jnp.where(x == 0, 1, x), x)
+    )
+    change = inside(b) - inside(a)
     return jnp.where(
         near, _atanhc(ratio) / jnp.where(near, total, 1), change / jnp.where(near, 1, d)
     )

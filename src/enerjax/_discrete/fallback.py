@@ -46,11 +46,13 @@ def fallback(primitive: Any, values: list[Value], params: dict[str, Any]) -> lis
             "numbers. Write the function with real numbers: cos and sin, real and "
             "imaginary parts."
         )
-    # Forward mode: a `while` has no other, and the increments stay linear in `d`.
+    # Forward mode, for a `while` has no other, and a `custom_vjp` none but reverse mode.
     # Choices stand as at either end in turn, which keeps the symmetry.
+    is_reverse = primitive.name == "custom_vjp_call"
+    jacobian = _reverse_jacobian if is_reverse else jax.jacfwd
     choices = (at_a, at_b) if switching else (at_a,)
     jacobians = [
-        jax.jacfwd(lambda x, at=at: function(x, at))(start + c * (end - start))
+        jacobian(lambda x, at=at: function(x, at))(start + c * (end - start))
         for c in _GAUSS
         for at in choices
     ]
@@ -68,6 +70,18 @@ def fallback(primitive: Any, values: list[Value], params: dict[str, Any]) -> lis
         rest = share(significant(defect, size), squares, decided)
         outs.append(Moving(a, b, mean @ d + rest))
     return outs
+
+
+def _reverse_jacobian(fn: Callable[[Array], list[Array]]) -> Callable:
+    """The Jacobians of the outputs; of those that are not real, `None`."""
+
+    def of(x: Array) -> list[Array | None]:
+        real = [jnp.issubdtype(out.dtype, jnp.inexact) for out in jax.eval_shape(fn, x)]
+        chosen = lambda x: [out for out, on in zip(fn(x), real, strict=True) if on]
+        found = iter(jax.jacrev(chosen)(x))
+        return [next(found) if on else None for on in real]
+
+    return of
 
 
 def _shared_out(primitive: Any, values: list[Value], params: dict[str, Any]) -> list[Value]:

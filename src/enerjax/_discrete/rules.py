@@ -14,7 +14,8 @@
 | `reduce_prod` | telescoping product, in both orders |
 | `cholesky`, `triangular_solve`, `custom_linear_solve`, `lu`, inverse | `linalg.py` |
 | `scan` | the rule of its body, with the increment in the carry |
-| `jit`, `custom_jvp`, `custom_vjp`, `remat` | of the program inside |
+| `jit`, `remat`; functions of JAX with a derivative of their own | of the program inside |
+| other functions under `custom_jvp`, `custom_vjp` | `fallback.py`, with the derivative that was given |
 | all others | `fallback.py` |
 """  # noqa: E501
 

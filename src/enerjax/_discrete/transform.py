@@ -28,7 +28,14 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array
 
-from .._tracing import evaluate, interpret, name_of, wrapped_program
+from .._tracing import (
+    evaluate,
+    function_with_own_derivative,
+    interpret,
+    name_of,
+    programs_within,
+    wrapped_program,
+)
 
 
 class Moving(NamedTuple):
@@ -99,7 +106,7 @@ class Walk:
             return evaluate(primitive, values, params)
         rule = self._rules.get(name_of(equation))
         inner = wrapped_program(equation)
-        if rule is None and inner is not None:
+        if rule is None and inner is not None and self._is_smooth(equation, inner[0]):
             return self.open(*inner, values)
         try:
             if rule is None:
@@ -108,5 +115,23 @@ class Walk:
         except NoRule:
             outs = self._fallback(primitive, values, params)
             if any(isinstance(out, Moving) for out in outs):
-                self.fallbacks.append(primitive.name)
+                name, given = primitive.name, function_with_own_derivative(equation)
+                self.fallbacks.append(f"{name} {given[0]}" if given else name)
             return outs
+
+    def _is_smooth(self, equation: Any, inner: Any) -> bool:
+        """Whether the derivative of what an equation wraps is that of the program inside.
+
+        A user may give another one: a slope to a look-up in a table, or to the norm of a
+        vector that vanishes. Of functions of JAX's own with a derivative it is, in other
+        words, wherever the program inside consists of functions with rules; where it works
+        on the bits of a number it is not.
+        """
+        given = function_with_own_derivative(equation)
+        return given is None or (given[1] and self._has_rules(inner))
+
+    def _has_rules(self, jaxpr: Any) -> bool:
+        return all(
+            name_of(eqn) in self._rules or any(map(self._has_rules, programs_within(eqn)))
+            for eqn in jaxpr.eqns
+        )
