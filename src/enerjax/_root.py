@@ -186,8 +186,10 @@ def find_root(
 
     The implicit function theorem gives its derivatives with respect to `args`, with one
     linear solve each; a singular lane of a batch has non-finite derivatives of its own and
-    leaves the others alone. `guess`, `factors` (of a solve before) and `others`, guesses that
-    `Newton` turns to where it fails, only say where to begin. With `skip`, `Newton` returns the guess without an iteration.
+    leaves the others alone. `guess`, `factors` (of a solve before) and `others`,
+    guesses that
+    `Newton` turns to where it fails, only say where to begin. With `skip`, `Newton`
+    returns the guess without an iteration.
 
     `fill`, like the guess, is for equations that do not determine some of the unknowns,
     and do not ask for them either: small numbers that are added to the diagonal of the
