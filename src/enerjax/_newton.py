@@ -107,7 +107,8 @@ class _Iterate(eqx.Module):
 # all, it does so before.
 PATIENCE = 12
 # Without damping. Of the steps of a double pendulum with an inner mass 200 times lighter,
-# at h = 0.01, that are found only so, those found with 20 Jacobians are on the branch of the
+# at h = 0.01, that are found only so, those found with 20 Jacobians are on the branch of
+# the
 # motion, and those that take longer are mostly not.
 _UNDAMPED_PATIENCE = 20
 # What a correction may leave of the one before, for its Jacobian to serve on. What steps
