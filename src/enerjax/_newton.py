@@ -108,8 +108,7 @@ class _Iterate(eqx.Module):
 PATIENCE = 12
 # Without damping. Of the steps of a double pendulum with an inner mass 200 times lighter,
 # at h = 0.01, that are found only so, those found with 20 Jacobians are on the branch of
-# the
-# motion, and those that take longer are mostly not.
+# the motion, and those that take longer are mostly not.
 _UNDAMPED_PATIENCE = 20
 # What a correction may leave of the one before, for its Jacobian to serve on. What steps
 # before have left is never used as it is, near as it can be: it is blind to what has become

@@ -213,11 +213,11 @@ def find_root(
     start = jax.lax.stop_gradient(start)
     traced, opened = _opened(fn, guess, args)
     call = lambda y, inputs: opened(inputs[0], y, inputs[1])
-    near, others = None, None
+    near, traced_too = None, None
     if simplified is not None and flat.size > LARGE:
-        others, opened_too = _opened(simplified, guess, guess, args)
+        traced_too, opened_too = _opened(simplified, guess, guess, args)
         near = lambda y, held, inputs: opened_too(inputs[2], y, held, inputs[1])
-    inputs = traced, args, others
+    inputs = traced, args, traced_too
     return _root(call, near, root_finder, inputs, start, max_iterations)
 
 

@@ -132,6 +132,12 @@ class Walk:
 
     def _has_rules(self, jaxpr: Any) -> bool:
         return all(
-            name_of(eqn) in self._rules or any(map(self._has_rules, programs_within(eqn)))
+            name_of(eqn) in self._rules
+            or not any(map(_is_real, (*eqn.invars, *eqn.outvars)))
+            or any(map(self._has_rules, programs_within(eqn)))
             for eqn in jaxpr.eqns
         )
+
+
+def _is_real(atom: Any) -> bool:
+    return jnp.issubdtype(atom.aval.dtype, jnp.inexact)
