@@ -89,8 +89,6 @@ class _Iterate(eqx.Module):
     size: Scalar
     contraction: Scalar
     corrections: Count
-    # Of the attempts: which one this is, and the Jacobians it has had.
-    attempt: Count
     jacobians: Count
     # Jacobians in a row after which the correction was small and did not shrink.
     stalls: Count
@@ -124,11 +122,57 @@ def newton_iterations(
 ) -> _Iterate:
     """A search; `max_jacobians` are those of the attempts with damping, in all."""
     guesses = jnp.stack([ravel_pytree(x)[0] for x in (start.guess, *start.others)])
-    x0, num_attempts = guesses[0], guesses.shape[0]
-    eps = float(jnp.finfo(x0.dtype).eps)
-    first = PATIENCE if start.others else max_jacobians
-    limits = [first, max_jacobians - first, *[_UNDAMPED_PATIENCE] * num_attempts]
-    limit_of = lambda attempt: jnp.asarray(limits[:num_attempts])[attempt]
+    factors = residual.first_factors(start.factors, guesses[0])
+    first = _first(factors, guesses[0], jnp.array(0), start.skip)
+    num_attempts = guesses.shape[0]
+    if num_attempts == 1:
+        return _attempt(residual, newton, start, first, max_jacobians, True)
+    limits = [PATIENCE, max_jacobians - PATIENCE, *[_UNDAMPED_PATIENCE] * num_attempts]
+
+    def attempt(carry: tuple[Count, _Iterate]) -> tuple[Count, _Iterate]:
+        k, last = carry
+        begun = _first(last.factors, guesses[k], last.corrections, start.skip)
+        limit = jnp.asarray(limits[:num_attempts])[k]
+        return k + 1, _attempt(residual, newton, start, begun, limit, k < 2)
+
+    unfinished = lambda carry: ~carry[1].done & (carry[0] < num_attempts)
+    return jax.lax.while_loop(unfinished, attempt, (jnp.array(0), first))[1]
+
+
+def _first(
+    factors: AbstractFactors, x: Float[Array, " n"], corrections: Count, done: Flag
+) -> _Iterate:
+    """Where an attempt begins."""
+    zero, one, infinite = (jnp.asarray(value, x.dtype) for value in (0.0, 1.0, jnp.inf))
+    none, no, yes = jnp.array(0), jnp.array(False), jnp.array(True)
+    return _Iterate(
+        x,
+        factors,
+        jnp.zeros_like(x),
+        one,
+        infinite,
+        zero,
+        corrections,
+        none,
+        none,
+        zero,
+        no,
+        yes,
+        done,
+        no,
+    )
+
+
+def _attempt(
+    residual: Linearisable,
+    newton: Newton,
+    start: Start,
+    first: _Iterate,
+    max_jacobians: Count | int,
+    damped: Flag | bool,
+) -> _Iterate:
+    """A search from one guess."""
+    eps = float(jnp.finfo(first.x.dtype).eps)
 
     def linearise(carry: _Iterate) -> _Iterate:
         factors = carry.factors.renewed(residual.jacobian(carry.x))
@@ -177,53 +221,28 @@ def newton_iterations(
         first = ~fresh & (before.contraction == 0) & (before.size > eps**0.25)
         less = contraction <= 1 - 0.25 * before.part
         back = first & ~less & ~done & (before.part > _LEAST_PART)
-        back = back & (before.attempt < 2)
+        back = back & damped
         part = jnp.where(back, 0.5 * before.part, jnp.ones_like(before.part))
         broken = fresh & ~jnp.isfinite(size)
-        spent = before.jacobians >= limit_of(before.attempt)
-        lost = broken | (~kept & ~back & spent)
-        again = lost & ~done & (before.attempt < num_attempts - 1)
-        attempt = before.attempt + again.astype(before.attempt.dtype)
         stays = jnp.where(back, before.x + part * before.step, before.x)
         return _Iterate(
-            jnp.where(again, guesses[attempt], jnp.where(kept, x, stays)),
+            jnp.where(kept, x, stays),
             before.factors,
             jnp.where(fresh, correction, before.step),
             part,
-            jnp.where(again, jnp.inf, jnp.where(kept, size, before.size)),
-            jnp.where(fresh | again | back, 0, contraction),
+            jnp.where(kept, size, before.size),
+            jnp.where(fresh | back, 0, contraction),
             before.corrections + (kept | back).astype(before.corrections.dtype),
-            attempt,
-            jnp.where(again, 0, before.jacobians),
+            before.jacobians,
             stalls,
             defect,
             jnp.zeros_like(fresh),
-            (~kept & ~back) | again,
+            ~kept & ~back,
             done,
-            broken & ~again,
+            broken,
         )
 
-    zero, one, infinite = (jnp.asarray(x, x0.dtype) for x in (0.0, 1.0, jnp.inf))
-    none, no = jnp.array(0), jnp.array(False)
-    factors, yes = residual.first_factors(start.factors, x0), jnp.array(True)
-    first = _Iterate(
-        x0,
-        factors,
-        jnp.zeros_like(x0),
-        one,
-        infinite,
-        zero,
-        none,
-        none,
-        none,
-        none,
-        zero,
-        no,
-        yes,
-        start.skip,
-        no,
-    )
     unfinished = lambda c: (
-        ~(c.done | c.broken) & ~(c.stale & (c.jacobians >= limit_of(c.attempt)))
+        ~(c.done | c.broken) & ~(c.stale & (c.jacobians >= max_jacobians))
     )
     return jax.lax.while_loop(unfinished, correct, first)

@@ -123,9 +123,8 @@ class Walk:
         """Whether the derivative of what an equation wraps is that of the program inside.
 
         A user may give another one: a slope to a look-up in a table, or to the norm of a
-        vector that vanishes. Of functions of JAX's own with a derivative it is, in other
-        words, wherever the program inside consists of functions with rules; where it works
-        on the bits of a number it is not.
+        vector that vanishes. Functions of JAX and of this library give that of the program
+        inside, unless that works on the bits of a number: it has primitives without rules.
         """
         given = function_with_own_derivative(equation)
         return given is None or (given[1] and self._has_rules(inner))
