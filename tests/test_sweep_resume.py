@@ -64,6 +64,67 @@ def test_another_sweep_is_not_resumed(tmp_path):
         ej.sweep(loop(4), over, path=tmp_path / "loop")
 
 
+def stepped(scheme, newton):
+    """The end of a step of a scheme, as a function to be swept."""
+    system, start, args = ej.problems.pendulum_angle()
+
+    def step(h):
+        solution = ej.simulate(
+            system, scheme, start, args, h=h, num_steps=1, root_finder=newton
+        )
+        return solution.ys.q[-1]
+
+    return step
+
+
+def test_settings_that_no_shape_tells_make_another_sweep(tmp_path):
+    """Of the discrete derivative, its points, and Newton's tolerances."""
+    over, newton = {"h": [0.1]}, ej.Newton()
+    scheme = lambda derivative: ej.EnergyPreserving(derivative=derivative)
+    ej.sweep(stepped(scheme(ej.MeanValue(2)), newton), over, path=tmp_path)
+    ej.sweep(stepped(scheme(ej.MeanValue(2)), newton), over, path=tmp_path)
+    for other in (
+        stepped(scheme(ej.Gonzalez()), newton),
+        stepped(scheme(ej.MeanValue(3)), newton),
+        stepped(scheme(ej.MeanValue(2)), ej.Newton(rtol=2.0)),
+        stepped(scheme(ej.MeanValue(2)), ej.Newton(atol=9.0)),
+    ):
+        with pytest.raises(ValueError, match="another sweep .different: program"):
+            ej.sweep(other, over, path=tmp_path)
+
+
+FINGERPRINT = """
+import enerjax as ej
+ej.enable_fast_loops()
+import jax
+from enerjax._sweep.fingerprint import _digest
+from tests.test_sweep_resume import stepped
+jax.config.update("jax_enable_x64", True)
+for derivative in (ej.Gonzalez(), ej.MeanValue()):
+    fn = stepped(ej.EnergyPreserving(derivative=derivative), ej.Newton())
+    print(_digest(jax.jit(fn).trace(0.1).jaxpr))
+"""
+
+
+def test_a_program_of_one_function_has_the_same_name_in_every_process():
+    """And another where only what is inside of one function differs."""
+    found = []
+    for seed in ("1", "2"):
+        environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+        ran = subprocess.run(
+            [sys.executable, "-c", FINGERPRINT],
+            cwd=ROOT,
+            env=environment | {"JAX_PLATFORMS": "cpu", "PYTHONHASHSEED": seed},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert ran.returncode == 0, ran.stderr
+        found.append(ran.stdout.split())
+    assert found[0] == found[1]
+    assert found[0][0] != found[0][1]
+
+
 def process(*arguments, devices=1, **options):
     """The sweep in a process of its own."""
     environment = os.environ | {
@@ -122,7 +183,53 @@ def test_two_processes_find_what_one_finds(tmp_path):
 
 def test_drafts_are_no_results(tmp_path):
     """What a process leaves that is killed while it writes."""
-    (tmp_path / ".chunk-000000.npz.1").write_bytes(b"half")
+    old, new = (tmp_path / f".chunk-000000.npz.{k}" for k in range(2))
+    for draft in (old, new):
+        draft.write_bytes(b"half")
+    os.utime(old, (0, 0))
     found = ej.sweep(arithmetic, {"a": [1.0], "b": [2.0]}, path=tmp_path)
     assert re.search("1 lanes", str(found))
     assert found.values["sum"] == 3
+    # Another process may still be writing the new one.
+    assert new.exists()
+    assert not old.exists()
+
+
+def test_a_full_disk_leaves_no_draft(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(OSError, match="No space left"):
+        ej.sweep(arithmetic, {"a": [1.0], "b": [2.0]}, path=tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["sweep.json"]
+
+
+def test_a_damaged_file_is_named(tmp_path):
+    over = {"a": np.arange(4.0), "b": [2.0]}
+    first = ej.sweep(arithmetic, over, chunk=2, path=tmp_path).values["sum"]
+    file = tmp_path / "chunk-000001.npz"
+    whole = file.read_bytes()
+    flips = np.random.default_rng(0).integers(0, 8 * len(whole), 200)
+    damaged = [whole[:-30], b""]
+    for bit in flips:
+        content = bytearray(whole)
+        content[bit // 8] ^= 1 << (bit % 8)
+        damaged.append(bytes(content))
+    messages = []
+    for content in damaged:
+        file.write_bytes(content)
+        try:
+            again = ej.sweep(arithmetic, over, chunk=2, path=tmp_path).values["sum"]
+        except ValueError as error:
+            messages.append(str(error))
+        else:
+            # The damage was where the archive keeps dates and rights.
+            np.testing.assert_array_equal(again, first)
+    assert len(messages) > 150
+    assert all(f"{file} is damaged" in x and "Delete" in x for x in messages)
+    file.unlink()
+    label = tmp_path / "sweep.json"
+    label.write_bytes(b"{")
+    with pytest.raises(ValueError, match=r"sweep\.json.* is damaged"):
+        ej.sweep(arithmetic, over, chunk=2, path=tmp_path)

@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ._types import Flag
 
@@ -10,7 +11,7 @@ from ._types import Flag
 class RESULTS(eqx.Enumeration):
     """The outcome of a step or of a run; the message says what to do about it."""
 
-    successful = ""
+    successful = "successful"
     not_converged = (
         "Newton's method did not converge. The step may be too long for the motion: "
         "reduce `h`, or let steps that fail be divided: `max_halvings=4`, or let a "
@@ -71,3 +72,20 @@ def first_of(results: RESULTS) -> RESULTS:
     failed = results != RESULTS.successful
     first = jnp.argmax(failed)
     return jax.tree.map(lambda x: x[first], results)
+
+
+def meanings(outcomes: RESULTS) -> np.ndarray:
+    """What each outcome means, in a few words, in an array of their shape."""
+    (codes,) = jax.tree.leaves(outcomes)
+    known, places = np.unique(codes, return_inverse=True)
+    # The only name of an outcome that all enumerations show is their text for one.
+    texts = [str(jax.tree.map(lambda _, c=c: np.asarray(c), outcomes)) for c in known]
+    told = [text.partition("<")[2].removesuffix(">") or "successful" for text in texts]
+    words = np.array([text.partition(". ")[0].partition(":")[0] for text in told])
+    return words[places].reshape(np.shape(codes))
+
+
+def tally(outcomes: RESULTS) -> str:
+    """How often each outcome occurs: `3 successful, 1 Newton's method did not converge`."""
+    causes, numbers = np.unique(meanings(outcomes), return_counts=True)
+    return ", ".join(f"{n} {c}" for n, c in zip(numbers, causes, strict=True))

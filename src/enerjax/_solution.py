@@ -1,11 +1,13 @@
 from typing import Any
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from ._audit import Audit
-from ._results import RESULTS
+from ._results import RESULTS, tally
 from ._system import State
+from ._tracing import is_known
 from ._types import Count
 
 
@@ -54,6 +56,9 @@ class Solution(eqx.Module):
     its state; dissipation and work are those of the steps that have ended since the row
     before (of the first row since the start). So the balance of the audit is exact between
     rows at the ends of steps: the start, the end, and all rows of `ts="steps"`.
+
+    `print` tells the outcome, the steps and what Newton's method took for them, and the
+    account of the energy; of a batch all lanes together.
     """
 
     ts: Float[Array, " times"]
@@ -64,3 +69,31 @@ class Solution(eqx.Module):
     stats: Statistics
     end: State
     result: RESULTS
+
+    def __str__(self) -> str:
+        return _report(self) if is_known(self) else repr(self)
+
+
+def _report(solution: Solution) -> str:
+    stats = solution.stats
+    done, times = np.asarray(stats.completed_steps), np.asarray(solution.ts)
+    iterations, halvings = (
+        np.asarray(x) for x in (stats.newton_iterations, stats.halvings)
+    )
+    made = iterations[iterations > 0]
+    outcome, steps = tally(solution.result), f"{done}"
+    if done.ndim == 0:
+        outcome = outcome.removeprefix("1 ")
+    else:
+        outcome = f"{done.size} lanes: {outcome}"
+        steps = f"{done.min()} to {done.max()}"
+    rows = f"rows from t = {times.min():.6g} to {times.max():.6g}"
+    lines = [outcome, f"{steps} steps, {rows}"]
+    if made.size > 0:
+        lines.append(f"{np.mean(made):.1f} iterations a step, at most {np.max(made)}")
+    if np.any(halvings > 0):
+        divided = f"{np.sum(halvings > 0)} steps divided"
+        lines.append(f"{divided}, into up to {2 ** halvings.max()} parts")
+    if stats.rejected_steps is not None:
+        lines.append(f"{np.sum(stats.rejected_steps)} steps repeated with another length")
+    return "\n".join([*lines, str(solution.audit)])

@@ -45,6 +45,21 @@ class Mobility(NamedTuple):
     singular_values: Float[np.ndarray, " rank"]
     velocities: Float[np.ndarray, "nq dof"]
 
+    def __str__(self) -> str:
+        named = lambda rows: ", ".join(map(str, rows))
+        lines = [
+            f"{self.degrees_of_freedom} degrees of freedom, {self.rank} independent of "
+            f"{self.num_constraints} constraints"
+        ]
+        if self.redundant:
+            lines.append(f"follow from others: {named(self.redundant)}")
+        if self.inconsistent:
+            lines.append(f"violated, and not to be repaired: {named(self.inconsistent)}")
+        if self.rank:
+            least = self.singular_values[self.rank - 1]
+            lines.append(f"smallest singular value {least:.2g}: small near singular poses")
+        return "\n".join(lines)
+
 
 def mobility(
     system: AbstractSystem,

@@ -19,6 +19,7 @@ from .._schemes import AbstractScheme
 from .._system import AbstractSystem, State
 from .._tracing import is_known
 from .._types import Args, Real, Scalar
+from .derivatives import check_derivatives
 from .shapes import check_shapes, describe
 from .values import check_values
 
@@ -66,6 +67,8 @@ def prepare(
         raise ValueError(
             f"`h` must be a scalar, got shape {h.shape}. To sweep it use `jax.vmap`."
         )
+    if is_known((scheme, system, start, args)):
+        check_derivatives(scheme, system, start, args)
     return start, args, h, jnp.asarray(t, h.dtype)
 
 

@@ -1,5 +1,6 @@
 import abc
 from collections.abc import Callable
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,7 +19,13 @@ class AbstractDerivative(eqx.Module):
 
     is symmetric in `a` and `b`, and linear in `fn`: the discrete gradient of
     `V + lam . Phi` is that of `V` plus those of the constraints, row by row.
+
+    Schemes try the first two at the start of a run, with the functions of the system. A
+    form that is not directional must say so, `is_directional = False` in the class: the
+    energy is then not kept, and the audit of a run shows by how much.
     """
+
+    is_directional: ClassVar[bool] = True
 
     @abc.abstractmethod
     def gradient(

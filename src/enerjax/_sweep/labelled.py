@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._results import RESULTS
+from .._results import meanings, RESULTS, tally
 
 
 _Outcome = type(RESULTS.successful)
@@ -43,7 +43,7 @@ class Sweep:
         failed = np.zeros(self.shape, bool)
         for _, leaf in self._named():
             if isinstance(leaf, _Outcome):
-                failed |= _messages(leaf) != "successful"
+                failed |= meanings(leaf) != "successful"
         return failed
 
     def at(self, **chosen: Any) -> "Sweep":
@@ -109,7 +109,7 @@ class Sweep:
         }
         variables = {}
         for name, leaf in self._named():
-            array = _messages(leaf) if isinstance(leaf, _Outcome) else np.asarray(leaf)
+            array = meanings(leaf) if isinstance(leaf, _Outcome) else np.asarray(leaf)
             own = [f"{name}_{k}" for k in range(array.ndim - len(dims))]
             variables[name] = ((*dims, *own), array)
         coordinates = {}
@@ -128,9 +128,7 @@ class Sweep:
         lines = [f"{int(np.prod(self.shape))} lanes: {' x '.join(counts) or 'one point'}"]
         for name, leaf in self._named():
             if isinstance(leaf, _Outcome):
-                causes, numbers = np.unique(_messages(leaf), return_counts=True)
-                told = ", ".join(f"{n} {c}" for n, c in zip(numbers, causes, strict=True))
-                lines.append(f"  {name}: {told}")
+                lines.append(f"  {name}: {tally(leaf)}")
             else:
                 lines.append(f"  {name}: {leaf.dtype}{list(leaf.shape[len(self.axes) :])}")
         return "\n".join(lines)
@@ -176,16 +174,3 @@ class Sweep:
             self.parameters | chosen,
             jax.tree.map(lambda x: np.take(x, index, axis), self.values),
         )
-
-
-def _messages(outcomes: Any) -> np.ndarray:
-    """What each outcome means, in a few words."""
-    (codes,) = jax.tree.leaves(outcomes)
-    known, places = np.unique(codes, return_inverse=True)
-    # The only name of an outcome that all enumerations show is their text for one.
-    texts = [str(jax.tree.map(lambda _, c=c: np.asarray(c), outcomes)) for c in known]
-    meanings = [text.partition("<")[2].removesuffix(">") for text in texts]
-    words = np.array(
-        [m.partition(". ")[0].partition(":")[0] or "successful" for m in meanings]
-    )
-    return words[places].reshape(np.shape(codes))

@@ -1,13 +1,11 @@
 """The one program of a sweep: a chunk of lanes on all devices of this process."""
 
-import hashlib
 import inspect
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jax.sharding import Mesh, PartitionSpec
 
 
@@ -78,45 +76,3 @@ class Chunk:
         results = self._program(jax.tree.map(fill, parameters))
         # Copied: on CPUs a view would keep the memory of the device.
         return [np.array(x)[: self.lanes] for x in jax.tree.leaves(results)]
-
-
-def digest(traced: ClosedJaxpr) -> str:
-    """What a program computes, as one word: the same in every process.
-
-    Its text would not do: it names addresses of functions, and no constants.
-    """
-    word = hashlib.sha256()
-    _read(traced.jaxpr, traced.consts, lambda *parts: word.update(repr(parts).encode()))
-    return word.hexdigest()
-
-
-def _read(jaxpr: Jaxpr, consts: Any, tell: Callable) -> None:
-    names: dict[Any, int] = {}
-    name = lambda atom: (
-        (np.asarray(atom.val).tolist(), str(atom.aval))
-        if isinstance(atom, Literal)
-        else names.setdefault(atom, len(names))
-    )
-    for const in consts:
-        array = np.asarray(const)
-        tell(array.shape, str(array.dtype), hashlib.sha256(array.tobytes()).hexdigest())
-    tell([(name(x), str(x.aval)) for x in (*jaxpr.constvars, *jaxpr.invars)])
-    for eqn in jaxpr.eqns:
-        tell(eqn.primitive.name, [name(x) for x in eqn.invars])
-        for key in sorted(eqn.params):
-            tell(key)
-            _read_parameter(eqn.params[key], tell)
-        tell([(name(x), str(x.aval)) for x in eqn.outvars])
-    tell([name(x) for x in jaxpr.outvars])
-
-
-def _read_parameter(value: Any, tell: Callable) -> None:
-    if isinstance(value, ClosedJaxpr):
-        _read(value.jaxpr, value.consts, tell)
-    elif isinstance(value, Jaxpr):
-        _read(value, (), tell)
-    elif isinstance(value, tuple | list):
-        for part in value:
-            _read_parameter(part, tell)
-    elif value is None or isinstance(value, bool | int | float | str | np.dtype):
-        tell(value)

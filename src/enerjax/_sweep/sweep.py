@@ -1,4 +1,3 @@
-import hashlib
 import os
 import sys
 from collections.abc import Callable, Mapping
@@ -8,9 +7,10 @@ import jax
 import numpy as np
 
 from .._check import positive_integer
-from .grid import Grid, make_grid
+from .fingerprint import fingerprint
+from .grid import make_grid
 from .labelled import Sweep
-from .program import Chunk, digest, make_lane
+from .program import Chunk, make_lane
 from .store import Store
 
 
@@ -71,7 +71,7 @@ def sweep(
     **Returns:** a `Sweep`.
 
     **Raises:** `ValueError` or `TypeError` for bad input, for a `fn` that returns anything
-    else than arrays, and where `path` holds another sweep.
+    else than arrays, and where `path` holds another sweep or a file that is damaged.
     """
     grid = make_grid(over)
     chunk = positive_integer("chunk", chunk)
@@ -82,7 +82,7 @@ def sweep(
     lane, traced = make_lane(fn, first)
     count = -(-grid.size // chunk)
     chunks = _equal(order, count)
-    store = None if path is None else Store(path, _fingerprint(grid, chunks, traced))
+    store = None if path is None else Store(path, fingerprint(grid, chunks, traced))
     # Those of this process; the others are made elsewhere.
     own = range(jax.process_index(), count, jax.process_count())
     lanes = [min(chunks.shape[1], order.size - k * chunks.shape[1]) for k in own]
@@ -115,22 +115,6 @@ def _in_place(column: np.ndarray, order: np.ndarray, shape: tuple[int, ...]) -> 
     placed = np.empty_like(column, shape=(order.size, *column.shape[1:]))
     placed[order] = column[: order.size]
     return placed.reshape(*shape, *column.shape[1:])
-
-
-def _fingerprint(grid: Grid, chunks: np.ndarray, traced: Any) -> dict[str, str]:
-    word = hashlib.sha256(repr((grid.axes, grid.shape)).encode())
-    for name, values in grid.values.items():
-        word.update(repr((name, str(jax.tree.structure(values)))).encode())
-        for x in jax.tree.leaves(values):
-            word.update(repr((x.shape, str(x.dtype))).encode())
-            word.update(np.ascontiguousarray(x).tobytes())
-    order = hashlib.sha256(repr(chunks.shape).encode() + chunks.astype(np.int64).tobytes())
-    return {
-        "parameters": word.hexdigest(),
-        "chunks": order.hexdigest(),
-        "results": str(jax.tree.structure(traced.out_info)),
-        "program": digest(traced.jaxpr),
-    }
 
 
 def _exchange(

@@ -1,12 +1,15 @@
 """The numbers of a scene, found by name and kept kind by kind."""
 
+import textwrap
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, NoReturn
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from .._tracing import is_known
 from ._frames import Numbers
 from ._layout import Layout
 
@@ -27,6 +30,15 @@ class Parameters(eqx.Module):
 
     def __getitem__(self, key: str) -> Any:
         return _Section(self, key) if key in self.tables else self.own[key]
+
+    def __setitem__(self, key: str, value: Any) -> NoReturn:
+        _refuse(key)
+
+    def __str__(self) -> str:
+        lines = [f"{key} = {_told(value)}" for key, value in self.own.items()]
+        for section in self.tables:
+            lines += [f"{section}:", textwrap.indent(str(self[section]), "    ")]
+        return "\n".join(line for line in lines if line.strip())
 
     def set(self, name: str | None = None, /, **numbers: Any) -> "Parameters":
         """With other numbers of a part, or without a name others of your own.
@@ -68,16 +80,35 @@ def _like(old: Mapping[str, Any], key: str, value: Any) -> Any:
     return new
 
 
-class _Section(Mapping):
+class _ReadOnly(Mapping):
+    """What is found by name, and changed with `Parameters.set` alone."""
+
+    def __setitem__(self, key: str, value: Any) -> NoReturn:
+        _refuse(key)
+
+    def __delitem__(self, key: str) -> NoReturn:
+        _refuse(key)
+
+
+def _refuse(key: str) -> NoReturn:
+    raise TypeError(
+        f"`args[...]['{key}']` cannot be assigned to: the `args` of a scene are read by "
+        "name and changed by `args.set`, which returns new ones: "
+        '`args = args.set("crank", mass=2.0)`, and without a name for your own numbers '
+        "and gravity."
+    )
+
+
+class _Section(_ReadOnly):
     """The parts of one section by name."""
 
     def __init__(self, parameters: Parameters, section: str):
         self._tables = parameters.tables[section]
         self._places = parameters.layout.places[section]
 
-    def __getitem__(self, name: str) -> Numbers:
+    def __getitem__(self, name: str) -> "_Part":
         group, row = self._places[name]
-        return jax.tree.map(lambda table: table[row], self._tables[group])
+        return _Part(jax.tree.map(lambda table: table[row], self._tables[group]))
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._places)
@@ -86,4 +117,40 @@ class _Section(Mapping):
         return len(self._places)
 
     def __repr__(self) -> str:
-        return repr(dict(self))
+        return "\n".join(f"{name}: {part}" for name, part in self.items())
+
+
+@jax.tree_util.register_pytree_node_class
+class _Part(_ReadOnly):
+    """The numbers of one part; a tree of them, as a dictionary is."""
+
+    def __init__(self, numbers: Numbers):
+        self._numbers = numbers
+
+    def __getitem__(self, name: str) -> Any:
+        return self._numbers[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._numbers)
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    def __repr__(self) -> str:
+        return ", ".join(f"{name} = {_told(x)}" for name, x in self.items())
+
+    def tree_flatten(self) -> tuple[tuple[Numbers], None]:
+        return (self._numbers,), None
+
+    @classmethod
+    def tree_unflatten(cls, _: None, numbers: tuple[Numbers]) -> "_Part":
+        return cls(*numbers)
+
+
+def _told(value: Any) -> str:
+    """Numbers as one would write them; what is traced by its shape."""
+    if isinstance(value, jax.Array) and not is_known(value):
+        return str(jax.typeof(value))
+    if eqx.is_array(value):
+        return np.array2string(np.asarray(value), separator=", ").replace("\n", "")
+    return str(value)
