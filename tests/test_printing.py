@@ -38,7 +38,7 @@ def test_numbers_of_a_scene_are_changed_by_set_alone(pendulum):
         (args, "k"),
     ]
     for holder, key in assignments:
-        with pytest.raises(TypeError, match=rf"'{key}'\] cannot .* `args\.set`"):
+        with pytest.raises(TypeError, match=rf"'{key}'\]` cannot .* `args\.set`"):
             holder[key] = 5.0
     with pytest.raises(TypeError, match="`args.set`"):
         del args["bodies"]["bob"]["mass"]
