@@ -27,6 +27,8 @@ from .helpers import problem
         (lambda: ej.Composed(ej.EnergyPreserving(), 2), "order"),
         (lambda: ej.Composed(ej.EnergyConsistent(0.0), 4), "order"),
         (lambda: ej.MeanValue(points=0), "points"),
+        (lambda: ej.Newton(rtol=-1.0), "rtol"),
+        (lambda: ej.Newton(atol=float("nan")), "atol"),
     ],
 )
 def test_a_scheme_cannot_be_made_from_bad_numbers(make, message):
@@ -50,6 +52,15 @@ def test_a_scheme_cannot_be_made_from_what_it_does_not_know(make, message, is_ty
         pytest.skip("the type checker refuses it first")
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize("alpha", ["1", 1j])
+def test_a_dissipation_is_a_real_number(alpha, is_type_checked):
+    if is_type_checked:
+        pytest.skip("the type checker refuses it first")
+    for scheme in (ej.EnergyDecaying, ej.EnergyConsistent, ej.KappaDecaying):
+        with pytest.raises(TypeError, match=r"real number in \[0, 1\], got"):
+            scheme(alpha)
 
 
 @pytest.mark.parametrize("scheme", [ej.EnergyPreserving, ej.EnergyConsistent])

@@ -1,5 +1,7 @@
 """Orders of accuracy, against references in other coordinates and by other methods."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -134,6 +136,23 @@ def test_schemes_know_their_order():
     }
     assert {name: SCHEMES[name](0.0).order for name in expected} == expected
     assert ej.EnergyConsistent(0.5).order == 3
+
+
+def test_transformations_keep_the_order():
+    """Whether alpha is 0 is decided where a scheme is made."""
+    seen = []
+
+    def look(scheme):
+        seen.append((scheme.order, ej.Composed(scheme, 6).order))
+        return scheme.alpha
+
+    jax.jit(look)(ej.EnergyConsistent(0.0))
+    jax.grad(look)(ej.EnergyConsistent(0.0))
+    jax.jit(lambda x: look(ej.EnergyConsistent(0.0)) + x)(1.0)
+    jax.jit(lambda x: look(ej.EnergyConsistent.from_spectral_radius(1.0)) + x)(1.0)
+    assert seen == [(4, 6)] * 4
+    jax.vmap(lambda alpha: seen.append(ej.EnergyConsistent(alpha).order))(jnp.zeros(2))
+    assert seen[-1] == 3
 
 
 @pytest.mark.parametrize(

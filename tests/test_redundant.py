@@ -150,6 +150,36 @@ def test_derivatives_of_a_rod_that_is_declared_twice():
     assert reverse == pytest.approx(float(change), rel=1e-7)  # truncation
 
 
+@pytest.mark.parametrize(
+    "scheme", ["preserving index3", pytest.param("decaying", marks=pytest.mark.slow)]
+)
+def test_derivatives_of_multipliers_of_least_norm(scheme):
+    """Of rows whose parts in the force turn with the length: which part of it each takes is
+    for the norm to say, and changes too."""
+    rows = lambda q, l: jnp.stack([q @ q - l**2, 2 * (q @ q - l**2), (q @ q) ** 2 - l**4])
+    system = ej.System(jnp.eye(2), lambda q, args: G * q[1], rows, redundant=True)
+    up, across = jnp.array([0.8, 0.6]), jnp.array([-0.6, 0.8])
+
+    def forces(l):
+        start = ej.State(l * up, across)
+        run = ej.simulate(
+            system, SCHEMES[scheme](0.5), start, l, h=0.01, num_steps=5, throw=False
+        )
+        return run.multipliers[-1], run.stats.newton_iterations
+
+    run = jax.jit(forces)
+    _, iterations = run(1.3)
+    assert np.mean(iterations) < 6  # one solve, and not two
+    forward, _ = jax.jit(jax.jacfwd(forces, has_aux=True))(1.3)
+    reverse, _ = jax.jit(jax.jacrev(forces, has_aux=True))(1.3)
+    # Round-off, divided by what makes the equations regular.
+    np.testing.assert_allclose(forward, reverse, atol=1e-6)
+    step = 1e-4
+    change = (run(1.3 + step)[0] - run(1.3 - step)[0]) / (2 * step)
+    # The same, divided by the step.
+    np.testing.assert_allclose(forward, change, rtol=1e-4)
+
+
 def beam_of_parts(angle, **more):
     """On three parallel cranks, `angle` above the horizontal; `length` of the last."""
     up = np.array([np.cos(angle), np.sin(angle)])

@@ -4,7 +4,6 @@ Here the physics scales what Newton sees: rates by the inertia, multipliers by t
 gradients of their constraints, and everything by an energy of the step.
 """
 
-import functools
 from typing import Any
 
 import equinox as eqx
@@ -140,36 +139,21 @@ def solve(
     added = jax.tree.map(choose, smooth, last)
     guess = jax.tree.map(lambda x0, x, s: (x0 + x) / s, flight, added, unknown_scale)
     scale_down = lambda z: jax.tree.map(jnp.divide, z, unknown_scale)
-    find = functools.partial(
-        find_root,
+    root = find_root(
         scaled,
         root_finder,
-        args=inputs,
+        guess,
+        inputs,
         max_iterations=MAX_ITERATIONS,
         # What the last steps suggest can lie beyond a fold of the step equations, a flight
         # without force on the near side, or where rods turn far in it, a part of that.
         others=[scale_down(shortened(flight, part)) for part in (1.0, 0.5, 0.25)],
+        factors=jax.tree.map(_next, memory.factors),
+        skip=skip,
         fill=_fill(model, unknown_scale, row_scale),
         least=least,
         simplified=simplified if isinstance(scheme, AbstractSimplifiedSolve) else None,
     )
-    root = find(guess=guess, factors=jax.tree.map(_next, memory.factors), skip=skip)
-    if model.system.redundant:
-        # Again, from where constraints that repeat each other agree, and without forces:
-        # what is left open of these by the equations stays zero.
-        first = root
-        none = jax.tree.map(jnp.zeros_like, root.value)
-        guess = _with_multipliers(root.value, none)
-        root = find(guess=guess, factors=root.factors, skip=skip | ~root.found)
-        root = eqx.tree_at(
-            lambda root: (root.iterations, root.found, root.broken),
-            root,
-            (
-                root.iterations + first.iterations,
-                root.found & first.found,
-                root.broken | first.broken,
-            ),
-        )
     z = jax.tree.map(jnp.multiply, root.value, unknown_scale)
     end = scheme.finish(z, problem)
     result = from_root_finder(root.found, root.broken, root.finite)

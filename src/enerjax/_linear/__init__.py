@@ -13,6 +13,7 @@ from .blocks import (
 )
 from .dense import (
     AbstractFactors as AbstractFactors,
+    Inverse as Inverse,
     inverse as inverse,
     product as product,
     solve as solve,

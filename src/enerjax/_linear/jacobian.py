@@ -77,7 +77,7 @@ class Linearisable(eqx.Module):
     @property
     def keeps_factors(self) -> bool:
         """Whether the next iteration can begin with the factors of this one."""
-        return self.is_dense and self.fill is None
+        return self.is_dense
 
     def jacobian(self, x: Float[Array, " n"]) -> Array:
         """The Jacobian, in the form that `first_factors` are renewed with."""
@@ -100,12 +100,24 @@ class Linearisable(eqx.Module):
 
         Of a singular Jacobian with a `fill` the solution without part in its null space.
         """
-        solve = self._solver(x)
+        solve = self.filled_solver(x)
         first = solve(right)
         # What a fill has changed is taken back, but for its square.
         return first if self.fill is None else first + solve(self.fill * first)
 
-    def _solver(self, x: Float[Array, " n"]) -> Callable[[Array], Array]:
+    def open_part(
+        self, solve: Callable[[Array], Array], x: Float[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """The part of `x` in the null space of the Jacobian that `solve` solves with,
+        filled.
+
+        Of the rest only the square of what a fill changes is left. Unknowns without a fill
+        are determined: they have no such part.
+        """
+        assert self.fill is not None
+        return jnp.where(self.fill == 0, 0, solve(self.fill * solve(self.fill * x)))
+
+    def filled_solver(self, x: Float[Array, " n"]) -> Callable[[Array], Array]:
         """Solves with the Jacobian at `x`, filled."""
         if self.is_dense and self.fill is None and x.size <= SMALL:
             found = in_one_function(lambda x: inverse(self.jacobian(x)))(x)

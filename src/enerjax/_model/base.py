@@ -233,7 +233,8 @@ class AbstractModel(eqx.Module):
         return jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
 
     def _scales(self, state: State) -> Scales:
-        """The scales at `q`. They steer Newton's tests and never enter a solution."""
+        """The scales at `q`. They steer Newton's tests, and enter a solution only where
+        constraints repeat each other: in the norm of which the multipliers are least."""
         q = state.q
         coordinate = jnp.sqrt(self.metric(state).diagonal())
         constraint = lambda q: self.constraint(q, state.t)
@@ -244,4 +245,5 @@ class AbstractModel(eqx.Module):
         # as such; it must not turn the scaling into a division by zero.
         constraint = jnp.where(constraint > 0, constraint, 1.0)
         size = jnp.sum(jnp.abs(entries * q[columns]), axis=1)
-        return jax.lax.stop_gradient(Scales(coordinate, constraint, size))
+        scales = Scales(coordinate, constraint, size)
+        return scales if self.system.redundant else jax.lax.stop_gradient(scales)

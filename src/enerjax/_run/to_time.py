@@ -67,8 +67,6 @@ def simulate_until(
     else:
         max_steps = bound_on_steps(max_steps, MAX_STEPS)
         pace = controlled(controller, scheme, step / (end - begin))
-    # Whether alpha is 0 can be seen out here alone.
-    order = scheme.order
     solution, reached = _run(
         system,
         scheme,
@@ -81,7 +79,6 @@ def simulate_until(
         root_finder,
         max_halvings,
         max_steps,
-        order,
     )
     return raise_failure(solution, system, args, reached) if throw else solution
 
@@ -99,7 +96,6 @@ def _run(
     root_finder: RootFinder,
     max_halvings: int | None,
     max_steps: int,
-    order: int,
 ) -> tuple[Solution, Scalar]:
     """The run, and the time that it has reached. `rows`: times, all steps or both ends."""
     model = make_model(system, start, args)
@@ -168,7 +164,7 @@ def _run(
     elif isinstance(rows, str):
         saved = at_steps(run)
     else:
-        saved = at_times(run, rows, order)
+        saved = at_times(run, rows, scheme.order)
     ts, states, multipliers, details, energies = saved
     passed = (ts - t0) / duration
     rejected = None if isinstance(pace, EqualSteps) else end.attempts - end.completed

@@ -34,6 +34,10 @@ def as_alpha(alpha: Real) -> Scalar:
 
 def _unit_interval(number: Real) -> tuple[Scalar, bool]:
     """A number as an array, and whether it may lie in [0, 1] as far as is known."""
+    if isinstance(number, str) or jnp.iscomplexobj(number):
+        raise TypeError(
+            f"The dissipation of a scheme must be a real number in [0, 1], got {number!r}."
+        )
     if not is_known(number):
         return jnp.asarray(number, float), True
     # A constant keeps its value inside `jit` too.
@@ -50,7 +54,10 @@ def alpha_from_spectral_radius(rho_inf: Real) -> Scalar:
             f"rho_inf = {rho_inf} lies outside [0, 1]: it is the factor by which a step "
             "multiplies the amplitude of an infinitely fast oscillation."
         )
-    return (1 - rho_inf) / (1 + rho_inf)
+    if not is_known(rho_inf):
+        return (1 - rho_inf) / (1 + rho_inf)
+    with jax.ensure_compile_time_eval():
+        return (1 - rho_inf) / (1 + rho_inf)
 
 
 def predict_jump_and_end(

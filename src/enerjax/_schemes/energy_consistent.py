@@ -22,12 +22,7 @@ from .._types import Coordinates, Multipliers, Real, Scalar, Velocities
 from ._checks import check_derivative
 from ._decaying import alpha_from_spectral_radius, as_alpha, JumpAndEnd
 from ._frozen import freeze, Frozen
-from .base import (
-    AbstractSingleSolve,
-    Formulation,
-    StepEnd,
-    StepProblem,
-)
+from .base import AbstractSingleSolve, Formulation, StepEnd, StepProblem
 
 
 # The end of the step, and where it is an unknown the jump, a velocity.
@@ -80,11 +75,17 @@ class EnergyConsistent(AbstractSingleSolve[_Unknowns, Frozen]):
     in Livens form; F. Armero and I. Romero (2001), energy-dissipating schemes.
     """
 
-    alpha: Scalar = eqx.field(converter=as_alpha)
-    derivative: AbstractDerivative = MeanValue(points=2)
+    alpha: Scalar
+    derivative: AbstractDerivative
+    # Decided when the scheme is made: under a transformation `alpha` may be traced.
+    is_preserving: bool = eqx.field(static=True)
 
-    def __check_init__(self):
-        check_derivative("EnergyConsistent", self.derivative)
+    def __init__(self, alpha: Real, derivative: AbstractDerivative = MeanValue(points=2)):
+        check_derivative("EnergyConsistent", derivative)
+        self.alpha = as_alpha(alpha)
+        self.derivative = derivative
+        # In NumPy: under `jit` a comparison of JAX arrays would be traced.
+        self.is_preserving = is_known(self.alpha) and not np.any(np.asarray(self.alpha))
 
     @classmethod
     def from_spectral_radius(
@@ -99,8 +100,7 @@ class EnergyConsistent(AbstractSingleSolve[_Unknowns, Frozen]):
 
     @property
     def symmetric(self) -> bool:
-        # In NumPy: under `jit` a comparison of JAX arrays would be traced.
-        return is_known(self.alpha) and bool(np.all(np.asarray(self.alpha) == 0))
+        return self.is_preserving
 
     @property
     def order(self) -> int:

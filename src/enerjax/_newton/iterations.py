@@ -1,81 +1,21 @@
-"""Newton's method, on functions whose arguments and values are scaled to order one."""
+"""The iterations of Newton's method, for arguments and values scaled to order one."""
+
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from ._linear import AbstractFactors, KLU, largest, Linearisable
-from ._types import Count, Flag, Scalar
+from .._linear import AbstractFactors, largest, Linearisable
+from .._types import Count, Flag, Scalar
+from .settings import Newton, Start
 
 
 def max_norm(x: PyTree[Array]) -> Scalar:
     """The largest entry; for all residuals and corrections here are of order one."""
     return largest(ravel_pytree(x)[0])
-
-
-class Newton(eqx.Module):
-    """Newton's method on a problem scaled to order one, down to round-off.
-
-    One Jacobian serves several corrections, with an approximate inverse that is
-    extrapolated from those of the steps before, and improved. It is renewed where the
-    corrections `c_k` would shrink by less than three; such a correction is not made. Where
-    the first one after that of a new Jacobian is larger still, that went too far: it is
-    halved, up to seven times (P. Deuflhard's natural monotonicity test). Stops after a
-    correction whose error, predicted to be `c_k max(c_k / c_{k-1}, c_{k-1})`, is of
-    round-off size, or which was computed from a residual that is, or where corrections that
-    did shrink no longer do: coordinates far from the origin are too coarse for more. An
-    iteration that breaks down, or has not converged with 12 Jacobians, begins again from a
-    second guess, and then, without damping, from others: damping can end where the
-    residual has a smallest value that is no root, which full corrections leave.
-
-    **Arguments:**
-
-    - `rtol`: bound on the predicted error, in units of round-off of the dtype.
-    - `atol`: bound on the residual, in the same units.
-    - `linear_solver`: for its corrections and for derivatives of the root; one of lineax,
-      given the dense Jacobian, or `KLU()` where it is large and sparse. Without it size
-      and structure decide: plain operations up to 32 unknowns, LAPACK, and above 64 the
-      narrow band that the pattern of the equations can be numbered into, if there is one.
-      A scheme can name weak couplings without which the band is narrower: the search then
-      does without them, and begins again with them where it fails. Derivatives are exact.
-
-    A `linear_solver` of another type raises a `TypeError`.
-    """
-
-    rtol: float = 1.0
-    atol: float = 8.0
-    linear_solver: lx.AbstractLinearSolver | KLU | None = None
-
-    def __check_init__(self):
-        if not isinstance(self.linear_solver, lx.AbstractLinearSolver | KLU | None):
-            raise TypeError(
-                "`Newton(linear_solver=...)` must be a solver of lineax, such as "
-                f"`lineax.LU()`, or `enerjax.KLU()`; got {self.linear_solver!r}."
-            )
-
-
-class Start(eqx.Module):
-    """Where a solve begins.
-
-    - `guess`: first values of the unknowns.
-    - `others`: guesses for further attempts: the first of them with damping, the rest
-      without.
-    - `factors`: of the Jacobian of the solve before, where it is kept.
-    - `skip`: return the guess without an iteration.
-    - `fill`: for each unknown, what is added to the diagonal of a Jacobian that may be
-      singular; see `find_root`.
-    - `least`: where all unknowns are smaller, it is by round-off.
-    """
-
-    guess: PyTree[Array]
-    others: tuple[PyTree[Array], ...]
-    factors: AbstractFactors | None
-    skip: Flag
-    fill: PyTree[Array] | None
-    least: Scalar
 
 
 class _Iterate(eqx.Module):
@@ -194,34 +134,16 @@ def _attempt(
         floor = eps**0.125 * jnp.clip(largest(x), start.least, 1.0)
         size = largest(correction / (jnp.abs(x) + floor))
         defect, contraction = max_norm(value), size / before.size
-        small = size <= eps**0.25
         shrinks = contraction < _SHRINKS
-        # The contraction of a chord is what its Jacobian is off by: it stays. At least as
-        # much as the last correction moved it, and as it was: where one shrinks more, it
-        # is an accident.
-        rate = jnp.maximum(jnp.maximum(contraction, before.contraction), before.size)
-        converged = (size * rate <= newton.rtol * eps) & (defect <= eps**0.25)
-        converged = ~fresh & shrinks & converged
-        is_root = (defect <= newton.atol * eps) & small
-        # One that shrank, with this Jacobian, and no longer does has met the round-off.
-        ends = ~fresh & ~shrinks & (before.contraction > 0)
-        ends = ends & (defect <= eps**0.875) & small
-        # So has one with a Jacobian of its own; but where the residual is not tiny
-        # (coordinates a million lengths off) only if it happens again and again, and never
-        # where it is not small: a residual can have a smallest value that is no root. With
-        # one that is not exact corrections can shrink slowly, and go on.
-        stalled = fresh & small & (~shrinks if residual.is_exact else contraction >= 1)
-        stalls = jnp.where(fresh, jnp.where(stalled, before.stalls + 1, 0), before.stalls)
-        again_and_again = (stalls == _STALLS) & (defect <= eps**0.5) & residual.is_exact
-        ends = ends | (stalled & ((defect <= eps**0.75) | again_and_again))
-        done = (converged | is_root | ends) & jnp.isfinite(size)
+        new = _Size(size, contraction, defect, shrinks)
+        is_root, ends, stalls = _ends(before, new, newton, residual.is_exact, eps)
+        done = (is_root | ends) & jnp.isfinite(size)
         kept = fresh | shrinks | is_root
         # The first correction after one with a Jacobian of its own is what that has left
         # over: it went too far where that is more than there was, and more than round-off.
-        first = ~fresh & (before.contraction == 0) & (before.size > eps**0.25)
+        second = ~fresh & (before.contraction == 0) & (before.size > eps**0.25)
         less = contraction <= 1 - 0.25 * before.part
-        back = first & ~less & ~done & (before.part > _LEAST_PART)
-        back = back & damped
+        back = damped & second & ~less & ~done & (before.part > _LEAST_PART)
         part = jnp.where(back, 0.5 * before.part, jnp.ones_like(before.part))
         broken = fresh & ~jnp.isfinite(size)
         stays = jnp.where(back, before.x + part * before.step, before.x)
@@ -246,3 +168,40 @@ def _attempt(
         ~(c.done | c.broken) & ~(c.stale & (c.jacobians >= max_jacobians))
     )
     return jax.lax.while_loop(unfinished, correct, first)
+
+
+class _Size(NamedTuple):
+    """Of a correction, what it has left of the one before, and the residual it is from."""
+
+    size: Scalar
+    contraction: Scalar
+    defect: Scalar
+    shrinks: Flag
+
+
+def _ends(
+    before: _Iterate, new: _Size, newton: Newton, is_exact: bool, eps: float
+) -> tuple[Flag, Flag, Count]:
+    """Whether the residual is round-off, whether a correction ends the search for another
+    reason, and how many in a row have stalled."""
+    size, contraction, defect, shrinks = new
+    fresh, small = before.fresh, size <= eps**0.25
+    # The contraction of a chord is what its Jacobian is off by: it stays. At least as
+    # much as the last correction moved it, and as it was: where one shrinks more, it
+    # is an accident.
+    rate = jnp.maximum(jnp.maximum(contraction, before.contraction), before.size)
+    converged = (size * rate <= newton.rtol * eps) & (defect <= eps**0.25)
+    converged = ~fresh & shrinks & converged
+    is_root = (defect <= newton.atol * eps) & small
+    # One that shrank, with this Jacobian, and no longer does has met the round-off.
+    met = ~fresh & ~shrinks & (before.contraction > 0)
+    met = met & (defect <= eps**0.875) & small
+    # So has one with a Jacobian of its own; but where the residual is not tiny
+    # (coordinates a million lengths off) only if it happens again and again, and never
+    # where it is not small: a residual can have a smallest value that is no root. With
+    # one that is not exact corrections can shrink slowly, and go on.
+    stalled = fresh & small & (~shrinks if is_exact else contraction >= 1)
+    stalls = jnp.where(fresh, jnp.where(stalled, before.stalls + 1, 0), before.stalls)
+    again_and_again = (stalls == _STALLS) & (defect <= eps**0.5) & is_exact
+    met = met | (stalled & ((defect <= eps**0.75) | again_and_again))
+    return is_root, converged | met, stalls
