@@ -57,6 +57,29 @@ def test_a_hanging_chain_rests_in_the_catenary_polygon():
     assert jax.jvp(sag, (l,), (1.0,))[1] == pytest.approx(float(change), rel=1e-7)
 
 
+@pytest.mark.parametrize("stiffness", [0.0, 1.0, 20.0])
+def test_a_horizontal_arm_comes_to_rest(stiffness):
+    """Two links on torsion springs that are relaxed where they are horizontal: without
+    springs, or on soft ones, Newton's method does not find the way from there."""
+    springs = lambda q, args: 0.5 * args * (q[0] ** 2 + (q[1] - q[0]) ** 2)
+    weight = lambda q: 9.81 * (1.5 * jnp.sin(q[0]) + 0.5 * jnp.sin(q[1]))
+    system = ej.System(jnp.eye(2), lambda q, args: springs(q, args) + weight(q))
+    start = ej.State(jnp.zeros(2), jnp.zeros(2))
+    q = ej.equilibrium(system, start, stiffness).state.q
+    moment = jax.grad(lambda q: springs(q, stiffness) + weight(q))
+    # Solver; and stable, between horizontal and hanging.
+    np.testing.assert_allclose(moment(q), 0, atol=1e-12)
+    assert np.all(np.linalg.eigvalsh(jax.jacfwd(moment)(q)) > 0)
+    assert np.all((q < 0) & (q >= -np.pi / 2 - 1e-12))
+    if stiffness == 0:
+        np.testing.assert_allclose(q, -np.pi / 2)
+    slope = jax.jacfwd(lambda k: ej.equilibrium(system, start, k).state.q)(stiffness)
+    by_hand = -jnp.linalg.solve(
+        jax.jacfwd(moment)(q), jax.jacfwd(jax.grad(springs), argnums=1)(q, stiffness)
+    )
+    np.testing.assert_allclose(slope, by_hand, rtol=1e-9)  # round-off
+
+
 def test_no_equilibrium_is_told():
     system, start, args = problem("particles")
     free = ej.System(system.kinetic, lambda q, args: q[1])

@@ -1,8 +1,12 @@
 """Poses in which a system can rest."""
 
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from .._check import check_system
 from .._linear import largest
@@ -16,6 +20,12 @@ from .._types import Args, Coordinates, Flag, Multipliers, Real, Scalar
 
 # Newton may wander before it converges, on long chains for one.
 _MAX_ITERATIONS = 200
+# Of one attempt on the way down, and how many there are.
+_PATIENCE = 30
+_AT_ONCE = 8
+_TRIES = 100
+# The part of the first weight that is left out next.
+_SOFTEST = 1e-6
 
 
 class Equilibrium(eqx.Module):
@@ -38,10 +48,13 @@ def equilibrium(
     t: Real = 0.0,
     root_finder: RootFinder = Newton(),
 ) -> Equilibrium:
-    """A pose where `dV/dq + B^T lambda = L^T f` and `Phi = 0`, from a guess near it.
+    """A pose where `dV/dq + B^T lambda = L^T f` and `Phi = 0`, from a guess.
+
+    By Newton's method from a guess near it; from others by the way of a body that creeps
+    down its potential, which ends in a pose that is stable.
 
     Differentiable with respect to `args` by the implicit function theorem. What is found
-    can be unstable, as a pendulum on its head: `modes` tells.
+    at once can be unstable, as a pendulum on its head: `modes` tells.
 
     **Arguments:**
 
@@ -95,14 +108,15 @@ def _solve(
     unit = size / scales.coordinate
 
     def balance(x, inputs):
-        model, unit, size = inputs
+        model, unit, size, held, weight = inputs
         shift, tension = x
         q = q0 + unit * shift
         constraint, pull = jax.vjp(lambda q: model.constraint(q, guess.t), q)
         slope = model.slope(State(q, guess.v, guess.t))
         force = slope + pull(size * tension / scales.constraint)[0]
         rows = size * scales.constraint + scales.constraint_size
-        return force / (size * scales.coordinate), constraint / rows
+        force = force / (size * scales.coordinate) + weight * (shift - held)
+        return force, constraint / rows
 
     # The multipliers that come closest to balance: there are more rows than these.
     pull = jax.jacfwd(model.constraint)(q0, guess.t) / scales.coordinate[None]
@@ -111,12 +125,68 @@ def _solve(
     tension = jnp.linalg.lstsq(pull.T, -slope)[0] / size
     zero = (jnp.zeros_like(q0), tension)
     inputs = (model, unit, size)
-    root = find_root(balance, root_finder, zero, inputs, max_iterations=_MAX_ITERATIONS)
+    none = jnp.zeros_like(q0), jnp.zeros_like(size)
+    near = lambda x, held: balance(x, (*inputs, *held))
+    near = _come_near(near, root_finder, zero, _stiffness(near, zero, q0 / unit))
+    root = find_root(
+        balance, root_finder, near, (*inputs, *none), max_iterations=_MAX_ITERATIONS
+    )
     shift, tension = root.value
     q: Coordinates = q0 + unit * shift
     multipliers = size * tension / scales.constraint
-    residual = largest(jnp.concatenate(balance(root.value, inputs)))
+    residual = largest(jnp.concatenate(balance(root.value, (*inputs, *none))))
     return Equilibrium(State(q, guess.v), multipliers), residual, root.found
+
+
+def _come_near(
+    balance: Callable[[Any, tuple[Array, Scalar]], Any],
+    root_finder: RootFinder,
+    guess: tuple[Array, Array],
+    stiff: Scalar,
+) -> tuple[Array, Array]:
+    """A point from which Newton's method finds the balance, or the guess.
+
+    Where it does not find it in a few iterations it goes down the potential, step by
+    step: to where springs of some stiffness, the weight, that hold it to where it was
+    would let it come to rest. They are made softer where it does, and harder where that
+    fails too.
+    """
+
+    def unfinished(carry):
+        _, _, ok, tries = carry
+        return ~ok & (tries < _TRIES)
+
+    def attempt(carry):
+        x, weight, _, tries = carry
+        held = jax.lax.stop_gradient((x[0], weight))
+        root = find_root(balance, root_finder, x, held, max_iterations=_PATIENCE)
+        good = root.found & jnp.isfinite(root.residual)
+        # A search that wanders ends in whatever pose it meets, many turns away.
+        good = good & ((weight > 0) | (root.iterations <= _AT_ONCE))
+        x = jax.tree.map(lambda new, old: jnp.where(good, new, old), root.value, x)
+        softer = jnp.where(weight > _SOFTEST * stiff, weight / 4, 0)
+        harder = jnp.where(weight > 0, 16 * weight, stiff)
+        return x, jnp.where(good, softer, harder), good & (weight == 0), tries + 1
+
+    no_weight = jnp.zeros((), guess[0].dtype)
+    begin = guess, no_weight, jnp.array(False), jnp.array(0)
+    x, _, ok, _ = jax.lax.while_loop(unfinished, attempt, jax.lax.stop_gradient(begin))
+    return jax.tree.map(lambda new, old: jnp.where(ok, new, old), x, guess)
+
+
+def _stiffness(
+    balance: Callable[[Any, tuple[Array, Scalar]], Any],
+    guess: tuple[Array, Array],
+    place: Array,
+) -> Scalar:
+    """A weight that is stiffer than the potential, as the guess shows it."""
+    no_weight = jnp.zeros_like(guess[0]), jnp.zeros((), place.dtype)
+    along = jnp.cos(jnp.arange(place.size, dtype=place.dtype))
+    (force, _), (change, _) = jax.jvp(
+        lambda x: balance((x, guess[1]), no_weight), (guess[0],), (along,)
+    )
+    stiff = largest(change) + largest(force) / (largest(place) + 1e-3)
+    return jnp.where(stiff > 0, 16 * stiff, 1)
 
 
 def _size(model: AbstractModel, guess: State) -> Scalar:

@@ -19,6 +19,7 @@ HEADER = (
     "max |B v|",
     "Newton mean",
     "Newton max",
+    "divided",
     "us/step",
     "outcome",
 )
@@ -41,6 +42,7 @@ def row(run: Run) -> tuple[str, ...]:
         f"{largest(audit.constraint_rate):.1e}",
         f"{iterations.mean():.2f}",
         f"{iterations.max()}",
+        f"{np.count_nonzero(stats.halvings)}",
         f"{1e6 * run.seconds_per_step:.1f}",
         outcome(run),
     )
