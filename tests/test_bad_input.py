@@ -11,6 +11,7 @@ import enerjax as ej
 
 from .bad_functions import ARGS, kinetic, potential, rod, simulate
 from .bad_inputs import BAD, WRONG_TYPES
+from .helpers import problem
 
 
 def test_the_input_that_the_others_spoil_is_good():
@@ -82,3 +83,20 @@ assert abs(runs[1].audit.constraint).max() < 1e-5
 def test_single_precision_is_warned_of_once_and_works():
     done = subprocess.run([sys.executable, "-c", SINGLE], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_run_that_does_not_fit_into_memory_says_what_to_do():
+    system, start, args = problem("pendulum")
+    with pytest.raises(MemoryError, match=r"keeps 10{12} rows.*`save_every`"):
+        ej.simulate(system, ej.EnergyPreserving(), start, args, h=1e-3, num_steps=10**12)
+
+
+def test_a_function_without_return_is_asked_for_it():
+    def potential(q, args):
+        q @ q  # pyright: ignore
+
+    system = ej.System(lambda v, args: 0.5 * v @ v, potential)
+    with pytest.raises(TypeError, match=r"`potential` must .* Is its `return` missing\?"):
+        ej.simulate(
+            system, ej.EnergyPreserving(), ej.State([1.0], [0.0]), h=0.1, num_steps=1
+        )

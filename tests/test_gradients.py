@@ -127,6 +127,7 @@ def test_memory_of_the_reverse_pass_of_a_long_run():
     assert memory_of_the_reverse_pass(1_000_000) <= 2_000_000
 
 
+@pytest.mark.slow
 def test_second_derivatives_exist():
     fn = lambda g: end(parameters() | dict(g=g), SCHEMES["decaying"])
     both = jax.jit(lambda g: jax.jvp(jax.grad(fn), (g,), (jnp.ones_like(g),)))
@@ -218,6 +219,7 @@ def test_a_failed_lane_leaves_the_gradients_of_the_others_finite():
     np.testing.assert_allclose(slope[good], healthy[good], rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_numbers_that_the_functions_close_over_count():
     def tip(g):
         rod = lambda q, args: jnp.array([q @ q - 1.0])

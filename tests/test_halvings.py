@@ -45,6 +45,7 @@ def test_a_step_that_turns_a_link_over_fails_and_says_so():
     np.testing.assert_array_equal(solution.end.q, solution.ys.q[done])
 
 
+@pytest.mark.slow
 def test_it_is_done_in_parts_that_keep_energy_and_constraints():
     solution = batch()
     assert np.all(np.asarray(solution.result == ej.RESULTS.successful))

@@ -231,3 +231,13 @@ def test_too_much_that_is_known_is_told():
         ej.initial_state(system, [0.6, 0.8], [1.0, 0.0], args, known_v=[0, 1])
     with pytest.raises(ValueError, match="numbers from 0 to 1"):
         ej.initial_state(system, [0.6, 0.8], [1.0, 0.0], args, known_v=[2])
+
+
+def test_a_lane_without_a_start_leaves_the_others_alone():
+    system, _, args = problem("pendulum")
+    guesses = jnp.array([[1.0, 0.1], [9.0, 0.0], [0.3, 0.9]])
+    make = lambda q: ej.initial_state(system, q, jnp.zeros(2), args, throw=False)
+    starts = jax.vmap(make)(guesses)
+    assert np.isnan(starts.q).all(axis=1).tolist() == [False, True, False]
+    expected = guesses[0] / jnp.linalg.norm(guesses[0])
+    np.testing.assert_allclose(starts.q[0], expected, atol=4 * EPS)

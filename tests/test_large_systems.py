@@ -164,6 +164,7 @@ def test_a_chain_moves_as_with_a_dense_solver(scheme):
     assert jnp.max(jnp.abs(run.audit.constraint)) <= 50 * EPS
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_chain():
     system, start, args = ej.problems.chain(NUM_LINKS)
 
@@ -183,6 +184,7 @@ def test_derivatives_of_a_chain():
     assert value == pytest.approx(float(change / (2 * step)), rel=1e-6)  # truncation
 
 
+@pytest.mark.slow
 def test_lanes_of_chains_move_alone():
     system, start, args = ej.problems.chain(NUM_LINKS)
     run = eqx.filter_jit(

@@ -135,9 +135,9 @@ def lanes_by_hand(fn, axes):
     return call
 
 
-@pytest.mark.parametrize("jit", [False, True])
+@pytest.mark.parametrize("jit", [pytest.param(False, marks=pytest.mark.slow), True])
 @pytest.mark.parametrize("axes", BATCHED.values(), ids=BATCHED)
-@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.parametrize("name", ["one_step", pytest.param("run", marks=pytest.mark.slow)])
 def test_derivatives_of_batches(name, axes, jit):
     """Values, too: JAX compares neither with those of the function alone."""
     fn = FUNCTIONS[name]
@@ -203,6 +203,7 @@ def test_runs_of_small_systems_are_one_function():
         assert left == {"enerjax_one_function", "add_any"}
 
 
+@pytest.mark.slow
 def test_without_compiling_and_where_nans_are_looked_for():
     system, start, args = ej.problems.pendulum()
     step = lambda: ej.step(system, ej.EnergyPreserving(), start, args, h=0.01).state.q

@@ -112,6 +112,7 @@ def test_a_body_in_euler_parameters_is_a_place_and_a_rotation(jit):
     ]
 
 
+@pytest.mark.slow
 def test_derivatives_of_inverses_are_seen_through():
     """They keep the name of the inverse, and have more inputs and outputs."""
     matrix = lambda x: jnp.outer(x, jnp.sin(x)) + 3 * jnp.eye(x.size)

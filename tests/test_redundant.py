@@ -134,6 +134,7 @@ def test_derivatives_are_unique():
     assert reverse == pytest.approx(float(least), rel=2e-3)  # truncation, of the scheme
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_rod_that_is_declared_twice():
     rod = lambda q, l: jnp.array([1.0, 2.0]) * (q @ q - l**2)
     system = ej.System(jnp.eye(3), lambda q, args: G * q[1], rod, redundant=True)

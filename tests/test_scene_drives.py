@@ -99,6 +99,7 @@ def test_the_motor_of_a_slider_crank_gives_what_its_energy_and_the_damper_take()
     np.testing.assert_array_equal(multipliers[1:, 0], -torque)
 
 
+@pytest.mark.slow
 def test_drives_lead_points_along_their_paths():
     """In the plane: a place, a distance, and a slide along an axis that turns itself."""
     circle = lambda t, args: jnp.stack([jnp.cos(2 * t), args["r"] * jnp.sin(2 * t)])

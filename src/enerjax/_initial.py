@@ -46,13 +46,15 @@ def initial_state(
     t: Real = 0.0,
     known_q: Sequence[int] = (),
     known_v: Sequence[int] = (),
+    throw: bool = True,
 ) -> State:
     """The `State` nearest to `(q, v)` that satisfies the constraints.
 
     As `consistent_start`, of which it returns the state alone: the one that is given, where
     it satisfies them to round-off already.
     """
-    return _nearest(system, State(q, v), args, t, known_q, known_v, firmly=True)
+    known = known_q, known_v
+    return _nearest(system, State(q, v), args, t, known, firmly=True, throw=throw)
 
 
 def consistent_start(
@@ -64,6 +66,7 @@ def consistent_start(
     t: Real = 0.0,
     known_q: Sequence[int] = (),
     known_v: Sequence[int] = (),
+    throw: bool = True,
 ) -> ConsistentStart:
     """Projects a start onto the constraints and solves for what is in balance there.
 
@@ -83,6 +86,8 @@ def consistent_start(
     - `t`: the time of the start, for `force` and `driven`.
     - `known_q`, `known_v`: numbers of the coordinates and velocities that stay as they are
       given; the others are solved for. Velocities may be known that follow from others.
+    - `throw`: raise an error where there is no start. With `False` it is NaN, so that one
+      lane of a batch does not end the others; a run from there fails and says so.
 
     **Returns:** a `ConsistentStart`.
 
@@ -91,7 +96,8 @@ def consistent_start(
     `equinox.EquinoxRuntimeError` at run time. The same for constraints that are not
     independent at the start, with their rank.
     """
-    return _start(system, State(q, v), args, t, known_q, known_v, firmly=True)
+    known = known_q, known_v
+    return _start(system, State(q, v), args, t, known, firmly=True, throw=throw)
 
 
 def start_near(
@@ -99,7 +105,7 @@ def start_near(
 ) -> State:
     """As `initial_state`, but known velocities give way where the joints do not admit
     them."""
-    return _nearest(system, state, args, t, (), known_v, firmly=False)
+    return _nearest(system, state, args, t, ((), known_v), firmly=False, throw=True)
 
 
 def _nearest(
@@ -107,10 +113,10 @@ def _nearest(
     state: State,
     args: Args,
     t: Real,
-    known_q: Sequence[int],
-    known_v: Sequence[int],
+    known: tuple[Sequence[int], Sequence[int]],
     *,
     firmly: bool,
+    throw: bool,
 ) -> State:
     given, checked = check_system(system, state, args, t)
     if is_known((system, given, checked)):
@@ -118,7 +124,7 @@ def _nearest(
         # A small program spares the compilation of a large one.
         if is_known(met) and met:
             return State(given.q, given.v)
-    return _start(system, state, args, t, known_q, known_v, firmly=firmly).state
+    return _start(system, state, args, t, known, firmly=firmly, throw=throw).state
 
 
 def _start(
@@ -126,18 +132,22 @@ def _start(
     state: State,
     args: Args,
     t: Real,
-    known_q: Sequence[int],
-    known_v: Sequence[int],
+    known: tuple[Sequence[int], Sequence[int]],
     *,
     firmly: bool,
+    throw: bool,
 ) -> ConsistentStart:
     state, args = check_system(system, state, args, t)
-    known = _numbers("known_q", known_q, state.q), _numbers("known_v", known_v, state.v)
+    known = _numbers("known_q", known[0], state.q), _numbers("known_v", known[1], state.v)
     if known[1] and not isinstance(system, System):
         raise ValueError(
             "`known_v`: only the velocities of a plain `System` can be given in part."
         )
     start, near, kept, rank = _project(system, state, args, known)
+    if not throw:
+        independent = system.redundant | (rank == start.multipliers.size)
+        good = (near & kept if firmly else near) & independent
+        return jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), start)
     start = _raise_unless(
         near & kept if firmly else near,
         start,

@@ -54,6 +54,7 @@ def _shape(role: str, fn: Callable, *inputs: Any) -> tuple[int, ...]:
         raise TypeError(
             f"{describe(role, fn)} must return a real JAX array, got {kind}. Write it "
             "with `jax.numpy` from its arguments: `0.0 * q[0]` is a zero of the right kind."
+            + (" Is its `return` missing?" if out is None else "")
         )
     return out.shape
 
@@ -73,7 +74,8 @@ def _traced(role: str, fn: Callable, *inputs: Any) -> Any:
         ) from error
     except Exception as error:
         raise ValueError(
-            f"{describe(role, fn)} raised {type(error).__name__}: {error}. It is called "
+            f"{describe(role, fn)} raised {type(error).__name__}: "
+            f"{str(error).removesuffix('.')}. It is called "
             f"with {_SIGNATURES[role]}, and `args` is {_kind(inputs[-1])} here."
         ) from error
 

@@ -1,6 +1,10 @@
 """The one error of a run that failed."""
 
+import contextlib
+from collections.abc import Iterator
+
 import equinox as eqx
+import jax
 
 from .._analysis import mobility
 from .._results import RESULTS
@@ -41,6 +45,22 @@ def raise_failure(
     if solution.result in (RESULTS.not_converged, RESULTS.singular, RESULTS.nonfinite):
         message += _dependent_rows(system, solution, args, begin)
     raise eqx.EquinoxRuntimeError(message + "(`throw=False` returns the run up to there.)")
+
+
+@contextlib.contextmanager
+def memory_told(num_steps: int, num_rows: int) -> Iterator[None]:
+    """Says of a run that does not fit into memory what takes it, and what to do."""
+    try:
+        yield
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        raise MemoryError(
+            f"A run of {num_steps} steps that keeps {num_rows} rows, and three numbers for "
+            "each step, does not fit into memory. Keep fewer rows (`save_every`), and let "
+            "a run that is longer still go on in parts: each starts from `solution.end` of "
+            "the one before."
+        ) from error
 
 
 def _dependent_rows(

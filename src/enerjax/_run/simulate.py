@@ -17,7 +17,7 @@ from .._step import advance, first_warm, Warm
 from .._system import AbstractSystem, State
 from .._types import Args, Count, Flag, Real, Vector
 from .controller import StepController
-from .failure import raise_failure
+from .failure import memory_told, raise_failure
 from .reverse import keep_roots, scans
 from .selection import check_start, nan_unless, select
 from .to_time import simulate_until
@@ -123,18 +123,19 @@ def simulate(
             f"`num_steps` ({num_steps}) must be a multiple of `save_every` ({save_every})."
         )
     start, args, h, t0 = prepare(system, scheme, start, args, h, t0, root_finder)
-    solution = _run(
-        system,
-        scheme,
-        start,
-        args,
-        h,
-        t0,
-        root_finder,
-        max_halvings,
-        num_steps,
-        save_every,
-    )
+    with memory_told(num_steps, num_steps // save_every):
+        solution = _run(
+            system,
+            scheme,
+            start,
+            args,
+            h,
+            t0,
+            root_finder,
+            max_halvings,
+            num_steps,
+            save_every,
+        )
     if not throw:
         return solution
     reached = t0 + h * solution.stats.completed_steps.astype(h.dtype)

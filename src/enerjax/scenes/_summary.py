@@ -1,5 +1,7 @@
 """A scene in words."""
 
+from collections.abc import Callable
+
 from ._layout import Layout
 
 
@@ -9,25 +11,33 @@ def summary(
     ends: dict[str, tuple[str, str]],
     rows: dict[str, slice],
     may_repeat: bool,
-    freedoms: int | None,
+    count: Callable[[], int | None],
 ) -> str:
     """Bodies, joints, forces and drives with what they are and what they count for.
 
-    `freedoms` are those that were counted, where joints may repeat each other.
+    `count` finds the degrees of freedom where joints may repeat each other, or do: where
+    as many as there are would leave none.
     """
     bodies, joined = dict(layout.bodies), {x for pair in ends.values() for x in pair}
     held = sum(place.stop - place.start for place in rows.values())
-    least = ""
-    if freedoms is None:
-        internal = sum(kind.num_internal for kind in bodies.values())
-        independent = layout.num_velocities - internal - held
-        freedoms, least = max(independent, 0), "at least " if may_repeat else ""
+    internal = sum(kind.num_internal for kind in bodies.values())
+    independent = layout.num_velocities - internal - held
+    freedoms, least = independent, ""
+    if may_repeat or independent <= 0:
+        counted = count()
+        freedoms = max(independent, 0) if counted is None else counted
+        least = "at least " if counted is None else ""
     world = "the plane" if layout.dimension == 2 else "space"
     holders = "joints and drives" if layout.drives else "joints"
     lines = [
         f"A scene in {world}: {layout.num_coordinates} coordinates, {held} constraints of "
         f"{holders}, {least}{freedoms} degree{'' if freedoms == 1 else 's'} of freedom."
     ]
+    if freedoms > independent and not may_repeat:
+        lines.append(
+            f"{freedoms - independent} of the constraints repeat others: leave them out, "
+            "or declare `Scene(..., redundant=True)`."
+        )
     width = max(len(name) for name in kinds)
     line = lambda name, text: f"  {name:{width}}  {kinds[name]:14}  {text}".rstrip()
     first = 0

@@ -214,16 +214,16 @@ class Scene:
         return sol.multipliers[..., self._rows[joint]]
 
     def __str__(self) -> str:
-        may_repeat, freedoms = self.system.redundant, self._freedoms()
         parts = self._kinds, self._ends, self._rows
-        return summary(self._layout, *parts, may_repeat, freedoms)
+        return summary(self._layout, *parts, self.system.redundant, self._freedoms)
 
     def _freedoms(self) -> int | None:
-        """Degrees of freedom at the start of a redundant scene, if it has one."""
-        if not self.system.redundant or not is_known((self.q, self.v, self.args)):
+        """Degrees of freedom at the start, or `None` where there is no start."""
+        if not is_known((self.q, self.v, self.args)):
             return None
         try:
-            return self.mobility(self.start()).degrees_of_freedom
+            start = self.start() if self.system.redundant else State(self.q, self.v)
+            return self.mobility(start).degrees_of_freedom
         except ValueError:  # of a scene that cannot be closed
             return None
 
