@@ -22,6 +22,23 @@ def check_function(part: str, role: str, value: Any, *inputs: str) -> None:
         pass
 
 
+def takes_view(part: str, role: str, value: Any) -> bool:
+    """Whether a function is one of (view, t, args); raises if it is none of (t, args)
+    either. One that can be called both ways is taken for the shorter one."""
+    try:
+        check_function(part, role, value, "t", "args")
+    except TypeError as error:
+        if not callable(value):
+            raise
+        try:
+            check_function(part, role, value, "view", "t", "args")
+        except TypeError:
+            told = str(error).replace("(t, args)", "(t, args) or of (view, t, args)", 1)
+            raise TypeError(told) from None
+        return True
+    return False
+
+
 def ask(part: str, function: Callable, *inputs: Any) -> Any:
     """Its value; a number that it does not find is told."""
     try:
