@@ -51,8 +51,6 @@ class Moving(View):
 
     def length(self, name: str) -> Scalar:
         """The length of a part that has one."""
-        if not self._is_part(name):
-            raise ValueError(f"'{name}' is no part; {self._those_with(False)}")
         return self._value(name, is_angle=False)
 
     def rate(self, name: str) -> Scalar:
@@ -63,16 +61,18 @@ class Moving(View):
 
     def measured(self, name: str) -> tuple[Array, Array]:
         """The measure of a part, and its rate."""
+        measure = measure_of(self.layout, name)
         group, numbers = link_of(self.layout, name, self._args)
-        measure = group._replace(law=measure_of(self.layout, name))
-        value = lambda view: evaluate(measure, view, numbers)[0]
+        group = group._replace(law=measure)
+        value = lambda view: evaluate(group, view, numbers)[0]
         return value(self), self._rate_of(value)
 
     def _value(self, name: str, *, is_angle: bool) -> Scalar:
-        measure = measure_of(self.layout, name)
-        if measure.is_vector or measure.is_angle != is_angle:
-            what = "an angle" if is_angle else "a length"
-            raise ValueError(f"'{name}' does not have {what}; {self._those_with(is_angle)}")
+        kinds = measures_of(self.layout).items()
+        names = [x for x, m in kinds if m.is_angle == is_angle and not m.is_vector]
+        if name not in names:
+            what = "angle" if is_angle else "length"
+            raise ValueError(f"'{name}' has no {what}; the parts with one are {names}.")
         return self.measured(name)[0]
 
     def _is_part(self, name: str) -> bool:
@@ -81,14 +81,6 @@ class Moving(View):
     def _rate_of(self, value: Callable[[View], Array]) -> Array:
         of_q = lambda x: value(View(self.layout, x))
         return jax.jvp(of_q, (self.q,), (lift(self.layout, self.q, self.v),))[1]
-
-    def _those_with(self, is_angle: bool) -> str:
-        names = [
-            name
-            for name, x in measures_of(self.layout).items()
-            if x.is_angle == is_angle and not x.is_vector
-        ]
-        return f"those that have one are {names}."
 
 
 def measure_of(layout: Layout, name: str) -> AbstractMeasure:
