@@ -30,7 +30,8 @@ class Moving(View):
     - `velocity(body, point)`: of a point of a body, in space.
     - `angle(name)`, `length(name)`: of a part that has one, a hinge, a spring, a damper,
       an actuator or a drive; `angle` also of a body in the plane. Angles in space are
-      counted from the start pose and within half a turn, where they jump.
+      counted from the start pose and within half a turn, where they jump (of a joint with
+      an `axis_b` from where its `frame_a` and `frame_b` agree).
     - `rate(name)`: of this angle or length. It does not jump.
     """
 

@@ -23,8 +23,8 @@ def check_function(part: str, role: str, value: Any, *inputs: str) -> None:
 
 
 def takes_view(part: str, role: str, value: Any) -> bool:
-    """Whether a function is one of (view, t, args); raises if it is none of (t, args)
-    either. One that can be called both ways is taken for the shorter one."""
+    """Whether a function is one of (view, t, args), and not of (t, args), which comes
+    first where it can be called either way; raises for one that is neither."""
     try:
         check_function(part, role, value, "t", "args")
     except TypeError as error:

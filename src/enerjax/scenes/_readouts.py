@@ -28,7 +28,14 @@ class Readout(NamedTuple):
     - `rate`: its rate (length per time, radians per time).
     - `force`: along it: a force (energy per length), of an angle a torque (energy). It is
       positive where it pushes points apart or turns the second body counterclockwise, so
-      `force * rate` is its power. `None` where the part has none, or it is not known.
+      `force * rate` is its power. `None` where the part has none. That of a drive or a rod
+      (`Distance`) is known of multipliers, so not of a `State`; of a run it is a mean over
+      the step that ends at the row, and that of all others at the row itself.
+
+    Joints tell an angle if they are hinges (a cylindrical joint too), else how far they
+    slide. In the plane it is the difference of the angles of the bodies; in space it is
+    counted from the start pose, of a joint with an `axis_b` from where its `frame_a` and
+    `frame_b` agree. A torsion spring in space keeps to the angle within half a turn.
     """
 
     value: Array

@@ -188,6 +188,7 @@ class Scene:
     ) -> Readout:
         """Length or angle, its rate, and the force of a spring, damper, actuator, load or
         drive, of a hinge, slider or rod, along a run; also of a start or a state, at `t`.
+        `args` are those of the run, where they are not the scene's own.
 
         Angles of hinges in space count full turns along a run, from within half a turn of
         the start pose; of a state alone these are not known.
