@@ -4,4 +4,5 @@ from . import bodies as bodies, drives as drives, forces as forces, joints as jo
 from ._gaps import Gap as Gap
 from ._motions import Reaction as Reaction
 from ._parameters import Parameters as Parameters
+from ._readouts import Readout as Readout
 from .scene import Scene as Scene

@@ -11,14 +11,14 @@ from .._initial import start_near
 from .._system import State, System
 from .._tracing import is_known
 from .._types import Real
-from ._functions import drives_at, evaluate, lift
+from ._functions import drives_at
 from ._gaps import by_name, Measured, measured
 from ._laws import Driven, Missed
 from ._layout import Layout
 from ._measures import Turn
 from ._parameters import Parameters
 from ._rows import first_dependent
-from ._view import View
+from ._view import evaluate, lift, View
 
 
 # What is further off than this part of its bodies, or of their speed, is a mistake.

@@ -12,11 +12,12 @@ from jaxtyping import Array, Float
 
 from .._system import System
 from .._types import Coordinates, Multipliers, Scalar, Velocities
-from ._laws import AbstractPush, Driven
+from ._laws import AbstractPush, Acting, Driven
 from ._layout import Layout, Links
+from ._moving import Moving
 from ._own import ask, vector_of
 from ._parameters import Parameters
-from ._view import rows, View
+from ._view import evaluate, lift, rows, View
 
 
 def make_system(layout: Layout, over_constrained: bool) -> System:
@@ -95,17 +96,26 @@ def drives_at(
 ) -> list[tuple[Links, dict[str, Array]]]:
     """All drives, with the values that they prescribe now among their numbers."""
     groups = zip(layout.drive_groups, args.tables["drives"], strict=True)
-    return [(group, _now(group, numbers, t, args)) for group, numbers in groups]
+    return [(group, at_time(group, numbers, t, args)) for group, numbers in groups]
 
 
-def _now(
-    group: Links, numbers: dict[str, Array], t: Scalar, args: Parameters
+def at_time(
+    group: Links,
+    numbers: dict[str, Array],
+    t: Scalar,
+    args: Parameters,
+    view: Moving | None = None,
 ) -> dict[str, Array]:
-    """With the value of the signal, if there is one: the same for all links."""
+    """With the value of the signal, if there is one: the same for all links.
+
+    Forces may ask for the `view`, drives may not.
+    """
     assert isinstance(group.law, AbstractPush | Driven)
     if group.law.signal is None:
         return numbers
-    value = jnp.asarray(ask(group.names[0], group.law.signal, t, args)).astype(t.dtype)
+    feedback = isinstance(group.law, Acting) and group.law.feedback
+    inputs = (view, t, args) if feedback else (t, args)
+    value = jnp.asarray(ask(group.names[0], group.law.signal, *inputs)).astype(t.dtype)
     wanted = (args.layout.dimension,) if group.law.measure.is_vector else ()
     if value.shape != wanted:
         raise ValueError(
@@ -118,9 +128,9 @@ def _now(
 def force(
     layout: Layout, q: Coordinates, v: Velocities, t: Scalar, args: Parameters
 ) -> Velocities:
-    view = View(layout, q)
+    view = Moving(layout, q, v, args)
     groups = [
-        (group, _now(group, numbers, t, args))
+        (group, at_time(group, numbers, t, args, view))
         for group, numbers in zip(layout.force_groups, args.tables["forces"], strict=True)
         if isinstance(group.law, AbstractPush)
     ]
@@ -132,30 +142,14 @@ def force(
         return jax.jvp(measures, (q,), (lift(layout, q, v),))[1]
 
     now, pull = jax.vjp(rates, v)
-    return pull([_pushes(*pair, view, x) for pair, x in zip(groups, now, strict=True)])[0]
+    return pull([pushes(*pair, view, x) for pair, x in zip(groups, now, strict=True)])[0]
 
 
-def _pushes(group: Links, numbers: dict[str, Array], view: View, rate: Array) -> Array:
+def pushes(group: Links, numbers: dict[str, Array], view: View, rate: Array) -> Array:
+    """The forces of all links along their measures."""
     assert isinstance(group.law, AbstractPush)
     frames = view.frames(group.b, group.law.reads)
     return jax.vmap(group.law.push)(frames, rate, numbers)
-
-
-def lift(layout: Layout, q: Coordinates, v: Velocities) -> Coordinates:
-    """The rates of the coordinates."""
-    if not any(group.kind.num_redundant for group in layout.body_groups):
-        return v
-    rates = jnp.zeros_like(q)
-    for group in layout.body_groups:
-        lifted = jax.vmap(group.kind.lift)(rows(q, group.q), rows(v, group.v))
-        rates = rates.at[group.q].set(lifted)
-    return rates
-
-
-def evaluate(group: Links, view: View, numbers: dict[str, Array]) -> Array:
-    """What a law says of all its links, one row each."""
-    a, b = (view.frames(bodies, group.law.reads) for bodies in (group.a, group.b))
-    return jax.vmap(group.law)(a, b, numbers)
 
 
 def velocity_map(layout: Layout, q: Coordinates, args: Parameters) -> Float[Array, "nv nq"]:

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from .._types import Coordinates, Scalar
 from ._frames import Frame, Numbers
-from ._functions import drives_at, evaluate
+from ._functions import drives_at
 from ._laws import Driven, Length, Missed
 from ._layout import Layout, Links
 from ._measures import Separation, Slide
@@ -17,7 +17,7 @@ from ._motions import moved, pivot_of, still
 from ._own import vector_of
 from ._parameters import Parameters
 from ._rows import members
-from ._view import View
+from ._view import evaluate, View
 
 
 class Gap(NamedTuple):

@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 from .._types import Args, Multipliers, Scalar
 from ._frames import Frame, Numbers, Point
-from ._measures import AbstractLaw, AbstractMeasure, offset, PlanarTurn, Separation, Turn
+from ._measures import AbstractLaw, AbstractMeasure, offset
 
 
 @dataclass(frozen=True)
@@ -74,43 +74,43 @@ class Curve(AbstractLaw):
         return self.function(apart, numbers)
 
 
-@dataclass(frozen=True)
-class SpringEnergy(AbstractLaw):
-    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Scalar:
-        length = Separation()(a, b, numbers)
-        return 0.5 * numbers["stiffness"] * (length - numbers["length"]) ** 2
+class AbstractStored(AbstractLaw):
+    """An energy that depends on a measure; its force is minus the slope."""
 
+    measure: AbstractMeasure
 
-@dataclass(frozen=True)
-class PlanarTorsion(AbstractLaw):
-    reads = ("angle",)
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return self.measure.reads
 
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Scalar:
-        turn = PlanarTurn()(a, b, numbers)
-        return 0.5 * numbers["stiffness"] * (turn - numbers["angle"]) ** 2
+        return self.energy(self.measure(a, b, numbers), numbers)
 
-
-@dataclass(frozen=True)
-class Torsion(AbstractLaw):
-    reads = ("axes",)
-
-    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Scalar:
-        turn = Turn()(a, b, numbers)
-        return 0.5 * numbers["stiffness"] * (turn - numbers["angle"]) ** 2
+    @abc.abstractmethod
+    def energy(self, value: Array, numbers: Numbers) -> Scalar:
+        """The energy, for the value of the measure."""
 
 
 @dataclass(frozen=True)
-class Pull(AbstractLaw):
-    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Scalar:
-        return -jnp.sum(numbers["force"] * b.point(numbers["point_b"]))
+class Elastic(AbstractStored):
+    """A linear spring, without force where the measure is `numbers[rest]`."""
+
+    measure: AbstractMeasure
+    rest: str
+
+    def energy(self, value: Array, numbers: Numbers) -> Scalar:
+        return 0.5 * numbers["stiffness"] * (value - numbers[self.rest]) ** 2
 
 
 @dataclass(frozen=True)
-class PlanarTwist(AbstractLaw):
-    reads = ("angle",)
+class Steady(AbstractStored):
+    """A push that is `numbers[load]` for good."""
 
-    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Scalar:
-        return -numbers["torque"] * (b.angle - a.angle)
+    measure: AbstractMeasure
+    load: str
+
+    def energy(self, value: Array, numbers: Numbers) -> Scalar:
+        return -jnp.sum(numbers[self.load] * value)
 
 
 # Laws that time or velocities enter -----------------------------------------------------
@@ -152,7 +152,7 @@ class AbstractPush(AbstractLaw):
     """A force along a measure, that no potential has."""
 
     measure: AbstractMeasure
-    signal: Signal | None
+    signal: Callable[..., Array] | None
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -177,10 +177,14 @@ class Viscous(AbstractPush):
 
 @dataclass(frozen=True)
 class Acting(AbstractPush):
-    """A force that is `numbers["value"]` now."""
+    """A force that is `numbers["value"]` now.
+
+    With `feedback` its signal is a function of the bodies in motion too.
+    """
 
     measure: AbstractMeasure
-    signal: Signal
+    signal: Callable[..., Array]
+    feedback: bool
 
     def push(self, b: Frame, rate: Array, numbers: Numbers) -> Array:
         return numbers["value"]

@@ -1,7 +1,7 @@
 """Forces without a potential; they are public in `forces`."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 from jaxtyping import Array
 
@@ -16,8 +16,12 @@ from ._measures import (
     turn_of,
 )
 from ._numbers import number
-from ._own import check_function
+from ._own import takes_view
 from ._start import Ends
+
+
+# What a program gives: a function of time, or of the bodies in motion too.
+Program: TypeAlias = Callable[[Scalar, Args], Array] | Callable[[Any, Scalar, Args], Array]
 
 
 class Damper(AbstractForce):
@@ -68,66 +72,86 @@ class Actuator(AbstractForce):
 
     A scalar, along the line of the points; positive, it pushes them apart. Points that
     are not given are the origins of the frames; they must not meet.
+
+    With feedback a `force(view, t, args)`. `view` tells of the bodies as they move:
+
+    - `view.position(body, point)`, `view.velocity(body, point)`: in space, shape `(d,)`
+      (length, length per time); the mass centre if no point is given. `view.direction`.
+    - `view.length(name)`, `view.angle(name)`: of a spring, damper, actuator, joint or drive
+      that has one (radians); `view.angle` also of a body in the plane. About a hinge in
+      space the angle is counted from the start pose and lies within half a turn, where it
+      jumps: for more than that use its sine and cosine.
+    - `view.rate(name)`: of this length or angle. It has no jumps.
+    - `view.q`, `view.v`: all coordinates and velocities.
+
+    Schemes ask in the middle of a step, and its work there is that of the audit: feedback
+    is exact in the balance of every step, and of order 2.
     """
 
     name: str
     a: str
     b: str
-    force: Callable[[Scalar, Args], Array]
+    force: Program
     point_a: Vector | None = None
     point_b: Vector | None = None
 
     def __check_init__(self):
-        check_function(self.name, "force", self.force, "t", "args")
+        takes_view(self.name, "force", self.force)
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         points, _ = ends.apart(self.point_a, self.point_b)
-        return Acting(Separation(), self.force), points
+        feedback = takes_view(self.name, "force", self.force)
+        return Acting(Separation(), self.force, feedback), points
 
 
 class TorsionActuator(AbstractForce):
     """A torque between two bodies that a program gives: `torque(t, args)`, a scalar.
 
     It turns the second body counterclockwise, in space about `axis` as `TorsionDamper`,
-    and its opposite acts on the first.
+    and its opposite acts on the first. With feedback a `torque(view, t, args)`, a servo;
+    `view` tells what it does to an `Actuator`, so `view.angle(name)` and `view.rate(name)`
+    of the actuator itself are the angle between its bodies and the rate.
     """
 
     name: str
     a: str
     b: str
-    torque: Callable[[Scalar, Args], Array]
+    torque: Program
     axis: Vector | None = None
 
     def __check_init__(self):
-        check_function(self.name, "torque", self.torque, "t", "args")
+        takes_view(self.name, "torque", self.torque)
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         measure, numbers = turn_of(ends, self.axis)
-        return Acting(measure, self.torque), numbers
+        feedback = takes_view(self.name, "torque", self.torque)
+        return Acting(measure, self.torque, feedback), numbers
 
 
 class Load(AbstractForce):
     """A force on a point of a `body` that a program gives in space: `force(t, args)`.
 
-    A vector; `point` is the mass centre if it is not given.
+    A vector; `point` is the mass centre if it is not given. With feedback a
+    `force(view, t, args)`, as of an `Actuator`.
     """
 
     name: str
     a: str
     b: str
-    force: Callable[[Scalar, Args], Array]
+    force: Program
     point: Vector | None
 
-    def __init__(self, name: str, body: str, force: Any, point: Vector | None = None):
+    def __init__(self, name: str, body: str, force: Program, point: Vector | None = None):
         self.name, self.a, self.b = name, GROUND, body
         self.force, self.point = force, point
 
     def __check_init__(self):
-        check_function(self.name, "force", self.force, "t", "args")
+        takes_view(self.name, "force", self.force)
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         point = ends.origins(None, self.point)["point_b"]
-        return Acting(Place(), self.force), dict(point_b=point)
+        feedback = takes_view(self.name, "force", self.force)
+        return Acting(Place(), self.force, feedback), dict(point_b=point)
 
 
 class Follower(AbstractForce):
@@ -136,17 +160,18 @@ class Follower(AbstractForce):
     name: str
     a: str
     b: str
-    force: Callable[[Scalar, Args], Array]
+    force: Program
     point: Vector | None
 
-    def __init__(self, name: str, body: str, force: Any, point: Vector | None = None):
+    def __init__(self, name: str, body: str, force: Program, point: Vector | None = None):
         self.name, self.a, self.b = name, GROUND, body
         self.force, self.point = force, point
 
     def __check_init__(self):
-        check_function(self.name, "force", self.force, "t", "args")
+        takes_view(self.name, "force", self.force)
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         ends.only_bodies_that_turn()
         point = ends.origins(None, self.point)["point_b"]
-        return Following(Place(), self.force), dict(point_b=point)
+        feedback = takes_view(self.name, "force", self.force)
+        return Following(Place(), self.force, feedback), dict(point_b=point)

@@ -31,8 +31,9 @@ def offset(a: Frame, b: Frame, numbers: Numbers) -> Point:
 
 
 class AbstractMeasure(AbstractLaw):
-    """A length, an angle, or a place (a vector in space, if `is_vector`)."""
+    """A length, an angle (`is_angle`), or a place (`is_vector`, one in space)."""
 
+    is_angle: ClassVar[bool] = False
     is_vector: ClassVar[bool] = False
 
     def away(self, a: Frame, b: Frame, numbers: Numbers, value: Any) -> Multipliers:
@@ -76,6 +77,7 @@ class Place(AbstractMeasure):
 class PlanarTurn(AbstractMeasure):
     """The difference of two angles, over any number of turns."""
 
+    is_angle = True
     reads = ("angle",)
 
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Scalar:
@@ -86,6 +88,7 @@ class PlanarTurn(AbstractMeasure):
 class Turn(AbstractMeasure):
     """The angle about a common axis in space: it jumps at half a turn, but not its rate."""
 
+    is_angle = True
     reads = ("axes",)
 
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Scalar:

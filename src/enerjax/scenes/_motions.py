@@ -80,8 +80,8 @@ def _link(layout: Layout, name: str, args: Parameters) -> tuple[Links, Numbers]:
     return group._replace(law=group.law.measure), args["drives"][name]
 
 
-def each(function: Callable, q: Array, x: Array) -> Any:
+def each(function: Callable, q: Array, *others: Array) -> Any:
     """A function of one state, for all along the leading axes."""
     for _ in range(q.ndim - 1):
         function = jax.vmap(function)
-    return function(q, x)
+    return function(q, *others)

@@ -22,6 +22,23 @@ def check_function(part: str, role: str, value: Any, *inputs: str) -> None:
         pass
 
 
+def takes_view(part: str, role: str, value: Any) -> bool:
+    """Whether a function is one of (view, t, args), and not of (t, args), which comes
+    first where it can be called either way; raises for one that is neither."""
+    try:
+        check_function(part, role, value, "t", "args")
+    except TypeError as error:
+        if not callable(value):
+            raise
+        try:
+            check_function(part, role, value, "view", "t", "args")
+        except TypeError:
+            told = str(error).replace("(t, args)", "(t, args) or of (view, t, args)", 1)
+            raise TypeError(told) from None
+        return True
+    return False
+
+
 def ask(part: str, function: Callable, *inputs: Any) -> Any:
     """Its value; a number that it does not find is told."""
     try:

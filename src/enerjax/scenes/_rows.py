@@ -6,11 +6,11 @@ import numpy as np
 from jaxtyping import Array
 
 from .._types import Coordinates, Real
-from ._functions import constraint, driven, drives_at, evaluate, redundancy
+from ._functions import constraint, driven, drives_at, redundancy
 from ._layout import Layout
 from ._own import vector_of
 from ._parameters import Parameters
-from ._view import View
+from ._view import evaluate, View
 
 
 def members(layout: Layout) -> list[tuple[str, ...]]:
@@ -49,6 +49,20 @@ def rows_of(layout: Layout, q: Coordinates, args: Parameters) -> dict[str, slice
             places[name] = slice(first, first + shape[1])
             first += shape[1]
     return places
+
+
+def check_reacting(
+    joint: str, rows: dict[str, slice], ends: dict[str, tuple[str, str]]
+) -> None:
+    """Raises for what is no joint or drive between two bodies."""
+    if joint in rows and joint not in ends:
+        raise ValueError(
+            f"'{joint}' is a constraint of your own, between no two bodies: it has "
+            f"`scene.multipliers(sol, '{joint}')`, and `-B^T` of these is its force."
+        )
+    if joint not in rows:
+        joints = [name for name in rows if name in ends]
+        raise ValueError(f"There is no joint '{joint}'; there are {joints}.")
 
 
 def row_names(

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._tracing import is_known
-from .._types import Coordinates, Scalar, Vector
+from .._types import Coordinates, Scalar, Vector, Velocities
 from ._frames import Frame, Point
-from ._layout import Layout
+from ._layout import Layout, Links
 
 
 def rows(x: Array, index: np.ndarray) -> Array:
@@ -125,3 +125,20 @@ class View:
         if k > 0 and not self.layout.turning[k]:
             raise ValueError(f"'{body}' is a point mass: it has no angle.")
         return self.angles[k]
+
+
+def evaluate(group: Links, view: View, numbers: dict[str, Array]) -> Array:
+    """What a law says of all its links, one row each."""
+    a, b = (view.frames(bodies, group.law.reads) for bodies in (group.a, group.b))
+    return jax.vmap(group.law)(a, b, numbers)
+
+
+def lift(layout: Layout, q: Coordinates, v: Velocities) -> Coordinates:
+    """The rates of the coordinates."""
+    if not any(group.kind.num_redundant for group in layout.body_groups):
+        return v
+    rates = jnp.zeros_like(q)
+    for group in layout.body_groups:
+        lifted = jax.vmap(group.kind.lift)(rows(q, group.q), rows(v, group.v))
+        rates = rates.at[group.q].set(lifted)
+    return rates

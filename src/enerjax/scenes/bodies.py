@@ -13,6 +13,7 @@ import equinox as eqx
 from .._types import Real, Vector
 from ._frames import Numbers
 from ._kinds import AbstractKind, DirectorBodies, PlanarBodies, Points, QuaternionBodies
+from ._names import only_parts
 from ._numbers import joined, module_of, number, positive, velocities
 from ._rotations import mass_and_inertia, quaternion_of, rotation_matrix
 
@@ -237,3 +238,6 @@ class QuaternionBody(AbstractBody):
     @property
     def kind(self) -> AbstractKind:
         return QuaternionBodies()
+
+
+__dir__ = only_parts(globals())

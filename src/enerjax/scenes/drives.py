@@ -16,6 +16,7 @@ from .._types import Args, Scalar, Vector
 from ._frames import GROUND, Numbers
 from ._laws import Driven
 from ._measures import AbstractLaw, Place, Separation, Slide, turn_of
+from ._names import only_parts
 from ._own import check_function
 from ._start import Ends
 
@@ -117,3 +118,6 @@ class Position(AbstractDrive):
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         point = ends.origins(None, self.point)["point_b"]
         return Driven(Place(), self.motion), dict(point_b=point)
+
+
+__dir__ = only_parts(globals())

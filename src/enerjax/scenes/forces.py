@@ -14,7 +14,7 @@ from jaxtyping import Array
 from .._types import Args, Real, Vector
 from ._forces import AbstractForce as AbstractForce
 from ._frames import GROUND, Numbers
-from ._laws import PlanarTorsion, PlanarTwist, Pull, SpringEnergy, Torsion
+from ._laws import Elastic, Steady
 from ._loads import (
     Actuator as Actuator,
     Damper as Damper,
@@ -23,7 +23,8 @@ from ._loads import (
     TorsionActuator as TorsionActuator,
     TorsionDamper as TorsionDamper,
 )
-from ._measures import AbstractLaw
+from ._measures import AbstractLaw, Place, PlanarTurn, Separation, Turn
+from ._names import only_parts
 from ._numbers import number
 from ._own import check_function
 from ._start import Ends
@@ -47,7 +48,7 @@ class Spring(AbstractForce):
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         numbers, start = ends.apart(self.point_a, self.point_b)
         length = start if self.length is None else self.length
-        return SpringEnergy(), numbers | dict(
+        return Elastic(Separation(), "length"), numbers | dict(
             stiffness=number(ends.part, "`stiffness`", self.stiffness, ()),
             length=number(ends.part, "`length`", length, (), least=0.0),
         )
@@ -75,9 +76,9 @@ class TorsionSpring(AbstractForce):
         if ends.dimension == 2:
             ends.refuse_axes(self.axis)
             ends.only_bodies_that_turn()
-            law, start = PlanarTorsion(), ends.turn()
+            law, start = Elastic(PlanarTurn(), "angle"), ends.turn()
         else:
-            law, start = Torsion(), 0.0
+            law, start = Elastic(Turn(), "angle"), 0.0
             numbers |= ends.about(self.axis)
         angle = start if self.angle is None else self.angle
         return law, numbers | dict(angle=number(ends.part, "`angle`", angle, ()))
@@ -102,7 +103,7 @@ class ConstantForce(AbstractForce):
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         force = number(ends.part, "`force`", self.force, (ends.dimension,))
         point = ends.origins(None, self.point)["point_b"]
-        return Pull(), dict(force=force, point_b=point)
+        return Steady(Place(), "force"), dict(force=force, point_b=point)
 
 
 class ConstantTorque(AbstractForce):
@@ -124,7 +125,7 @@ class ConstantTorque(AbstractForce):
         ends.only_in_plane("A constant torque has a potential only in the plane")
         ends.only_bodies_that_turn()
         torque = number(ends.part, "`torque`", self.torque, ())
-        return PlanarTwist(), dict(torque=torque)
+        return Steady(PlanarTurn(), "torque"), dict(torque=torque)
 
 
 class Potential(eqx.Module):
@@ -139,3 +140,6 @@ class Potential(eqx.Module):
 
     def __check_init__(self):
         check_function(self.name, "function", self.function, "view", "args")
+
+
+__dir__ = only_parts(globals())

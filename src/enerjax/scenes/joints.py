@@ -24,6 +24,7 @@ from .._types import Args, Real, Vector
 from ._frames import Numbers
 from ._laws import Alignment, Curve, Length
 from ._measures import AbstractLaw
+from ._names import only_parts
 from ._numbers import module_of, positive
 from ._own import check_function, vector_of
 from ._start import Ends
@@ -244,3 +245,6 @@ class Constraint(eqx.Module):
 
     def __check_init__(self):
         check_function(self.name, "function", self.function, "view", "args")
+
+
+__dir__ = only_parts(globals())

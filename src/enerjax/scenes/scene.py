@@ -15,12 +15,13 @@ from .._tracing import is_known
 from .._types import Coordinates, Real, Vector
 from ._closing import check_poses, closed_start, gaps_of, Told
 from ._compile import compile_parts, join, sort_parts
-from ._frames import Point
-from ._functions import lift, make_system
+from ._functions import make_system
 from ._gaps import Gap, Measured
 from ._motions import each, Reaction, reaction
+from ._moving import Moving
 from ._parameters import Parameters
-from ._rows import row_names, rows_of
+from ._readouts import measured_along, Readout
+from ._rows import check_reacting, row_names, rows_of
 from ._summary import summary
 from ._view import View
 from .bodies import AbstractBody
@@ -166,12 +167,8 @@ class Scene:
 
     def velocity(self, ys: State, body: str, point: Vector | None = None) -> Array:
         """The velocity in space of a point of a body; otherwise as `position`."""
-
-        def velocity(q: Coordinates, v: Array) -> Point:
-            place = lambda x: View(self._layout, x).position(body, point)
-            return jax.jvp(place, (q,), (lift(self._layout, q, v),))[1]
-
-        return self._along(velocity, ys)
+        moving = lambda q, v: Moving(self._layout, q, v, self.args)
+        return self._along(lambda q, v: moving(q, v).velocity(body, point), ys)
 
     def direction(self, ys: State, body: str, axis: Vector) -> Array:
         """A direction that is fixed in a body, in space; otherwise as `position`."""
@@ -180,6 +177,27 @@ class Scene:
     def angle(self, ys: State, body: str) -> Array:
         """The angle of a body in the plane along a run, shape `(times,)`."""
         return self._along(lambda q, v: View(self._layout, q).angle(body), ys)
+
+    def measure(
+        self,
+        sol: Solution | ConsistentStart | Equilibrium | State,
+        name: str,
+        args: Parameters | None = None,
+        *,
+        t: Real = 0.0,
+    ) -> Readout:
+        """Length or angle, its rate, and the force of a spring, damper, actuator, load or
+        drive, of a hinge, slider or rod, along a run; also of a start or a state, at `t`.
+        `args` are those of the run, where they are not the scene's own.
+
+        Angles of hinges in space count full turns along a run, from within half a turn of
+        the start pose; of a state alone these are not known.
+
+        **Raises:** `ValueError` for a part without a length or angle, with those that have
+        one.
+        """
+        args = self.args if args is None else args
+        return measured_along(self._layout, self._rows, sol, name, t, args)
 
     def reaction(
         self,
@@ -193,14 +211,7 @@ class Scene:
         `args` are those of the run, where they are not the scene's own. Multipliers of a
         run are means over the step that ends at a row, and are taken to act there.
         """
-        if joint in self._rows and joint not in self._ends:
-            raise ValueError(
-                f"'{joint}' is a constraint of your own, between no two bodies: it has "
-                f"`scene.multipliers(sol, '{joint}')`, and `-B^T` of these is its force."
-            )
-        if joint not in self._rows:
-            joints = [name for name in self._rows if name in self._ends]
-            raise ValueError(f"There is no joint '{joint}'; there are {joints}.")
+        check_reacting(joint, self._rows, self._ends)
         at_rest = isinstance(sol, ConsistentStart | Equilibrium)
         ys = sol.state if at_rest else sol.ys
         args, ends = self.args if args is None else args, self._ends[joint]

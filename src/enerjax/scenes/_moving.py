@@ -1,0 +1,133 @@
+"""Bodies in motion: what a law with feedback may ask for."""
+
+from collections.abc import Callable
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from .._types import Coordinates, Scalar, Vector, Velocities
+from ._frames import Numbers, Point
+from ._laws import AbstractPush, AbstractStored, Alignment, Driven, Length
+from ._layout import Layout, Links
+from ._measures import (
+    AbstractLaw,
+    AbstractMeasure,
+    PlanarTurn,
+    Separation,
+    Slide,
+    Turn,
+)
+from ._parameters import Parameters
+from ._view import evaluate, lift, View
+
+
+class Moving(View):
+    """A scene at its coordinates `q` and velocities `v`.
+
+    Besides what a `View` tells:
+
+    - `velocity(body, point)`: of a point of a body, in space.
+    - `angle(name)`, `length(name)`: of a part that has one, a hinge, a spring, a damper,
+      an actuator or a drive; `angle` also of a body in the plane. Angles in space are
+      counted from the start pose and within half a turn, where they jump (of a joint with
+      an `axis_b` from where its `frame_a` and `frame_b` agree).
+    - `rate(name)`: of this angle or length. It does not jump.
+    """
+
+    def __init__(self, layout: Layout, q: Coordinates, v: Velocities, args: Parameters):
+        super().__init__(layout, q)
+        self.v = v
+        self._args = args
+
+    def velocity(self, body: str, point: Vector | None = None) -> Point:
+        """The velocity in space of a point of a body; its mass centre if none is given."""
+        return self._rate_of(lambda view: view.position(body, point))
+
+    def angle(self, body: str) -> Scalar:
+        """The angle of a body in the plane, or of a part that has one."""
+        if self._is_part(body):
+            return self._value(body, is_angle=True)
+        return super().angle(body)
+
+    def length(self, name: str) -> Scalar:
+        """The length of a part that has one."""
+        return self._value(name, is_angle=False)
+
+    def rate(self, name: str) -> Scalar:
+        """The rate of the angle or length of a part, of the angle of a body."""
+        if self._is_part(name):
+            return self.measured(name)[1]
+        return self._rate_of(lambda view: view.angle(name))
+
+    def measured(self, name: str) -> tuple[Array, Array]:
+        """The measure of a part, and its rate."""
+        measure = measure_of(self.layout, name)
+        group, numbers = link_of(self.layout, name, self._args)
+        group = group._replace(law=measure)
+        value = lambda view: evaluate(group, view, numbers)[0]
+        return value(self), self._rate_of(value)
+
+    def _value(self, name: str, *, is_angle: bool) -> Scalar:
+        kinds = measures_of(self.layout).items()
+        names = [x for x, m in kinds if m.is_angle == is_angle and not m.is_vector]
+        if name not in names:
+            what = "angle" if is_angle else "length"
+            raise ValueError(f"'{name}' has no {what}; the parts with one are {names}.")
+        return self.measured(name)[0]
+
+    def _is_part(self, name: str) -> bool:
+        return isinstance(name, str) and name not in self.layout.numbers_of_bodies
+
+    def _rate_of(self, value: Callable[[View], Array]) -> Array:
+        of_q = lambda x: value(View(self.layout, x))
+        return jax.jvp(of_q, (self.q,), (lift(self.layout, self.q, self.v),))[1]
+
+
+def measure_of(layout: Layout, name: str) -> AbstractMeasure:
+    """What a part measures; raises for one that has no measure."""
+    found = measures_of(layout)
+    if name not in found:
+        raise ValueError(
+            f"'{name}' is no part with a length or an angle; there are {[*found]}."
+        )
+    return found[name]
+
+
+def measures_of(layout: Layout) -> dict[str, AbstractMeasure]:
+    """The measures of all parts that have one."""
+    found = {}
+    for link in (*layout.joints, *layout.forces, *layout.drives):
+        turn = all(k == 0 or bool(layout.turning[k]) for k in (link.a, link.b))
+        measure = _measure(link.law, layout.dimension, turn)
+        if measure is not None:
+            found[link.name] = measure
+    return found
+
+
+def _measure(law: AbstractLaw, dimension: int, both_turn: bool) -> AbstractMeasure | None:
+    if isinstance(law, AbstractStored | AbstractPush | Driven):
+        return law.measure
+    if isinstance(law, Length):
+        return Separation()
+    if not isinstance(law, Alignment):
+        return None
+    if law.keeps_axis:
+        return Turn()
+    if law.along is not None:
+        return Slide()
+    pins = dimension == 2 and not law.square
+    return PlanarTurn() if pins and both_turn else None
+
+
+def link_of(layout: Layout, name: str, args: Parameters) -> tuple[Links, Numbers]:
+    """A joint, force or drive alone, and its numbers, as a table of one row."""
+    groups = dict(
+        joints=layout.joint_groups, forces=layout.force_groups, drives=layout.drive_groups
+    )
+    section = next(key for key in groups if name in layout.places[key])
+    number, row = layout.places[section][name]
+    group, only = groups[section][number], slice(row, row + 1)
+    table = {key: x[only] for key, x in args.tables[section][number].items()}
+    a, b = (np.asarray(x[only]) for x in (group.a, group.b))
+    return Links(group.law, (name,), a, b), table
