@@ -95,7 +95,8 @@ def test_a_function_without_return_is_asked_for_it():
     def potential(q, args):
         q @ q  # pyright: ignore
 
-    system = ej.System(lambda v, args: 0.5 * v @ v, potential)
+    kinetic = lambda v, args: 0.5 * v @ v
+    system = ej.System(kinetic, potential)  # pyright: ignore
     with pytest.raises(TypeError, match=r"`potential` must .* Is its `return` missing\?"):
         ej.simulate(
             system, ej.EnergyPreserving(), ej.State([1.0], [0.0]), h=0.1, num_steps=1

@@ -110,6 +110,7 @@ FUNCTIONS = dict(
     run=run,
     one_step=one_step,
 )
+RUNS = ["run", "one_step"]  # which take long to compile
 # Which of the two inputs differ from lane to lane.
 BATCHED = {"both": (0, 0), "first": (0, None), "second": (None, 0)}
 

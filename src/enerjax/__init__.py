@@ -70,6 +70,7 @@ from .scenes import (
     joints as joints,
     Parameters as Parameters,
     Reaction as Reaction,
+    Readout as Readout,
     Scene as Scene,
 )
 
