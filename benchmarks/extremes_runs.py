@@ -29,6 +29,7 @@ class Row:
     - `happened`: "success", or the step that failed and the cause.
     - `error`, `allowed`: distance from the reference, and what the order of the scheme
       and the round-off of the input leave.
+    - `phase`: what the run itself estimates its phase to be off by.
     - `leak`: energy that the balance does not explain, of the largest energy moved.
     """
 
@@ -44,6 +45,7 @@ class Row:
     constraint: float
     constraint_rate: float
     newton: float
+    phase: float
     verdict: str
 
 
@@ -109,6 +111,7 @@ def judge(
         _largest(audit.constraint[good]),
         _largest(audit.constraint_rate[good]),
         float(np.mean(iterations[: max(done, 1)])),
+        float(solution.phase_error),
         verdict,
     )
 

@@ -92,7 +92,6 @@ def tip(g, steps, save_every):
     return solution.ys.q[-1, 0]
 
 
-# Steps that fill segments of the run, and that do not.
 @pytest.mark.parametrize(
     "cut", long([(100, False), (101, False), (103, True)], (100, False), (101, False))
 )
@@ -219,7 +218,6 @@ def test_a_failed_lane_leaves_the_gradients_of_the_others_finite():
     np.testing.assert_allclose(slope[good], healthy[good], rtol=1e-10)
 
 
-@pytest.mark.slow
 def test_numbers_that_the_functions_close_over_count():
     def tip(g):
         rod = lambda q, args: jnp.array([q @ q - 1.0])

@@ -107,6 +107,7 @@ def _in_parts(
         before.iterations,
         before.residual,
         RESULTS.successful,
+        before.roughness,
         begin(start, length),
     )
     done, _ = jax.lax.scan(part, first, jnp.arange(most, dtype=h.dtype))
@@ -131,7 +132,8 @@ def _joined(a: Solved, b: Solved, parts: Scalar) -> Solved:
         b.end.result,
         b.end.carried,
     )
-    return Solved(end, a.iterations + b.iterations, b.residual, b.result, b.memory)
+    made = a.iterations + b.iterations
+    return Solved(end, made, b.residual, b.result, b.roughness, b.memory)
 
 
 def _select(choice: Flag, yes: Any, no: Any) -> Any:

@@ -5,11 +5,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import PyTree
+from jaxtyping import Array, Float, PyTree
 
 from ._model import AbstractModel, force_size, Increment
 from ._system import State
-from ._types import Scalar
+from ._types import Coordinates, Scalar
 
 
 # What Newton may try to resolve of that round-off. It stops where corrections no longer
@@ -61,6 +61,41 @@ def scales_like(
 
     unknowns, rows = (jax.tree.map(f, z, is_leaf=is_increment) for f in (unknown, row))
     return unknowns, rows, jnp.clip(least / root, small, 1.0)
+
+
+def roughness(
+    coordinate: Coordinates, added: PyTree[Any], before: PyTree[Any]
+) -> Float[Array, " 2"]:
+    """How large the second and the third difference of velocities are, from step to step.
+
+    Of what steps add to a free flight, this one and the three before: in the square root
+    of an energy, without derivatives.
+    """
+    is_increment = lambda x: isinstance(x, Increment)
+    ends = lambda z: jax.tree.leaves(z, is_leaf=is_increment)[-1].rate
+    rates = jnp.concatenate([ends(added)[None], ends(before)]) * coordinate[None]
+    second = jnp.diff(rates, n=2, axis=0)
+    sizes = jnp.stack([jnp.linalg.norm(x) for x in (second[0], second[0] - second[1])])
+    return jax.lax.stop_gradient(sizes)
+
+
+def local_error(sizes: Float[Array, "stages 2"], order: int) -> Scalar:
+    """What a step is off by, in velocities, as the square root of an energy.
+
+    Of the trapezoidal rule a sixth of the second difference. Methods of higher order are
+    better by powers of the angle in a step, which the third difference tells, and by the
+    constants of Gauss' methods.
+    """
+    second, third = sizes.T
+    angle = jnp.where(second > 0, third / jnp.where(second > 0, second, 1), 0)
+    better = jnp.where(angle > _RESOLVED, 1.0, angle ** (order - 2) / _BETTER[order])
+    return jnp.sum(better * second) / 6
+
+
+# An angle in a step beyond which no order helps.
+_RESOLVED = 1.2
+# The error of the midpoint rule over that of a method of this order, at an angle of one.
+_BETTER = {2: 1.0, 3: 6.0, 4: 60.0, 6: 8400.0, 8: 2.1e6}
 
 
 def shortened(flight: PyTree[Any], part: float) -> PyTree[Any]:

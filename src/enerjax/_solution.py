@@ -1,6 +1,7 @@
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
@@ -8,7 +9,7 @@ from ._audit import Audit
 from ._results import RESULTS, tally
 from ._system import State
 from ._tracing import is_known
-from ._types import Count
+from ._types import Count, Scalar
 
 
 class Statistics(eqx.Module):
@@ -18,6 +19,11 @@ class Statistics(eqx.Module):
     - `residual`: of each step, the largest entry of the step equations, scaled to order
       one, before the last correction; of the step that failed what Newton came to.
     - `halvings`: of each step, how often it had to be halved; see `simulate`.
+    - `local_error`: of each step, an estimate of what it is off by, as the square root of
+      an energy: of the velocities, weighted by the root of the inertia. By how they change
+      from step to step, and the order of the scheme; a guide, and no bound. The estimates
+      of all steps, over the root of twice the largest kinetic energy, tell to which part
+      of the motion its phase can be believed at most: see `phase_error`.
     - `completed_steps`: number of steps before the first failure, or all.
     - `rejected_steps`: of a run with a `StepController`, how many steps were repeated with
       another length, the last one of a failed run included; else `None`.
@@ -29,6 +35,7 @@ class Statistics(eqx.Module):
     newton_iterations: Int[Array, " steps"]
     residual: Float[Array, " steps"]
     halvings: Int[Array, " steps"]
+    local_error: Float[Array, " steps"]
     completed_steps: Count
     rejected_steps: Count | None = None
 
@@ -70,6 +77,17 @@ class Solution(eqx.Module):
     end: State
     result: RESULTS
 
+    @property
+    def phase_error(self) -> Scalar:
+        """What the motion may be off by at the end, in parts of itself: an estimate.
+
+        The local errors of all steps, over the largest velocity. Energy and constraints
+        hold at any step; this tells whether the motion is resolved.
+        """
+        largest = jnp.nanmax(self.audit.kinetic, axis=-1)
+        total = jnp.sum(self.stats.local_error, axis=-1)
+        return total / jnp.sqrt(2 * jnp.where(largest > 0, largest, jnp.inf))
+
     def __str__(self) -> str:
         return _report(self) if is_known(self) else repr(self)
 
@@ -96,4 +114,6 @@ def _report(solution: Solution) -> str:
         lines.append(f"{divided}, into up to {2 ** halvings.max()} parts")
     if stats.rejected_steps is not None:
         lines.append(f"{np.sum(stats.rejected_steps)} steps repeated with another length")
+    phase = np.nanmax(np.asarray(solution.phase_error), initial=0.0)
+    lines.append(f"phase of the motion, by local errors: to about {phase:.1e}")
     return "\n".join([*lines, str(solution.audit)])

@@ -17,7 +17,7 @@ from ._model import AbstractModel, Increment
 from ._newton import max_norm
 from ._results import first_failure, from_root_finder, RESULTS
 from ._root import find_root, RootFinder
-from ._scaling import scales_like, shortened
+from ._scaling import roughness, scales_like, shortened
 from ._schemes import (
     AbstractCarryingSolve,
     AbstractSimplifiedSolve,
@@ -56,6 +56,7 @@ class Solved(eqx.Module):
     - `residual`: largest entry of the step equations, scaled to order one, before the last
       correction.
     - `result`: whether, and how, it failed.
+    - `roughness`: differences of velocities from step to step; see `_scaling.py`.
     - `memory`: for the next.
     """
 
@@ -63,6 +64,7 @@ class Solved(eqx.Module):
     iterations: Count
     residual: Scalar
     result: RESULTS
+    roughness: Array
     memory: Memory
 
 
@@ -165,13 +167,14 @@ def solve(
     off = lambda x: max_norm(
         jax.tree.map(lambda x, y, unit: (x - y) / unit, added, x, unknown_scale)
     )
-    memory = Memory(
+    after = Memory(
         jax.tree.map(_pushed, added, memory.added),
         off(smooth) <= off(last),
         jax.tree.map(_pushed, root.factors, memory.factors),
         end.carried,
     )
-    return Solved(end, root.iterations, root.residual, result, memory)
+    rough = roughness(model.scales.coordinate, added, memory.added)
+    return Solved(end, root.iterations, root.residual, result, rough, after)
 
 
 def _next(x: Array) -> Array:

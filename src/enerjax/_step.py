@@ -19,6 +19,7 @@ from ._newton import Newton
 from ._one_function import in_one_function
 from ._results import first_of, RESULTS
 from ._root import RootFinder
+from ._scaling import local_error
 from ._schemes import AbstractScheme
 from ._solve import first_memory, Memory
 from ._system import AbstractSystem, State
@@ -52,6 +53,7 @@ class StepOutput(eqx.Module):
     - `newton_iterations`: over all solves of the step.
     - `residual`: of the step equations, see `Statistics`.
     - `halvings`: how often the step, or a stage of it, was halved.
+    - `local_error`: an estimate; see `Statistics`.
     - `result`: a `RESULTS`; compare it with `RESULTS.successful`.
     - `warm`: pass it to the next step.
     """
@@ -63,6 +65,7 @@ class StepOutput(eqx.Module):
     newton_iterations: Count
     residual: Scalar
     halvings: Count
+    local_error: Scalar
     result: RESULTS
     warm: Warm
 
@@ -112,7 +115,7 @@ def advance(
             max_halvings,
         )
         end = solved.end
-        costs = (solved.iterations, solved.residual, halvings)
+        costs = (solved.iterations, solved.residual, halvings, solved.roughness)
         reported = (end.multipliers, end.energies, end.details, costs, solved.result)
         q, rest = _sum_and_rest(state.q, end.displacement + rest)
         state = State(q, end.state.v, end.state.t)
@@ -122,7 +125,7 @@ def advance(
     begin, inputs = (start, warm.rest), (lengths, warm.stages)
     (state, rest), (lengths, reported, memory) = jax.lax.scan(stage, begin, inputs)
     multipliers, energies, details, costs, results = reported
-    iterations, residuals, halvings = costs
+    iterations, residuals, halvings, sizes = costs
     return StepOutput(
         state,
         # The mean force over the step: stages count by their length, backwards ones too.
@@ -132,6 +135,7 @@ def advance(
         jnp.sum(iterations),
         largest(residuals),
         jnp.max(halvings),
+        local_error(sizes, scheme.order),
         first_of(results),
         Warm(memory, rest),
     )

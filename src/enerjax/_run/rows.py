@@ -21,7 +21,7 @@ class Step(eqx.Module):
     - `reached`: state and multipliers at the end; `None` where no rows are made of them.
     - `details`: what the scheme reports of its own.
     - `energies`: zero for a step that was rejected.
-    - `costs`: iterations, residual and halvings.
+    - `costs`: iterations, residual, halvings and local error.
     - `passed`: the part of the whole time that has passed at its end.
     """
 
@@ -30,7 +30,7 @@ class Step(eqx.Module):
     energies: Energies
     passed: Float[Array, " steps"]
     accepted: Bool[Array, " steps"]
-    costs: tuple[Array, Array, Array]
+    costs: tuple[Array, Array, Array, Array]
 
 
 class Run(eqx.Module):

@@ -180,7 +180,7 @@ def _run(
             jax.tree.map(lambda x: jnp.where(good, x, 0), out.energies),
             jax.tree.map(
                 lambda x: jnp.where(skip, 0, x),
-                (out.newton_iterations, out.residual, out.halvings),
+                (out.newton_iterations, out.residual, out.halvings, out.local_error),
             ),
         )
 
@@ -206,7 +206,7 @@ def _run(
         row0,
         (states, multipliers, energies),
     )
-    iterations, residuals, halvings = (x.reshape(-1) for x in costs)
+    costs = [x.reshape(-1) for x in costs]
     saved = jnp.arange(0, num_steps + 1, save_every, dtype=h.dtype)
     return Solution(
         t0 + h * saved,
@@ -214,7 +214,7 @@ def _run(
         multipliers,
         details,
         audit(model, timed(states, saved), energies),
-        Statistics(iterations, residuals, halvings, end.completed),
+        Statistics(*costs, completed_steps=end.completed),
         model.leave(end.state),
         end.result,
     )

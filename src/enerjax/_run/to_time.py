@@ -137,7 +137,7 @@ def _run(
         )
         energies = jax.tree.map(lambda x: jnp.where(good, x, 0), out.energies)
         states = None if rows is None else (state, multipliers)
-        costs = out.newton_iterations, out.residual, out.halvings
+        costs = out.newton_iterations, out.residual, out.halvings, out.local_error
         costs = jax.tree.map(lambda x: jnp.where(live, x, 0), costs)
         return after, Step(states, out.details, energies, passed, good, costs)
 
@@ -168,14 +168,13 @@ def _run(
     ts, states, multipliers, details, energies = saved
     passed = (ts - t0) / duration
     rejected = None if isinstance(pace, EqualSteps) else end.attempts - end.completed
-    iterations, residuals, halvings = steps.costs
     solution = Solution(
         ts,
         jax.vmap(model.leave)(states),
         multipliers,
         details,
         audit(model, jax.vmap(timed)(states, passed), energies),
-        Statistics(iterations, residuals, halvings, end.completed, rejected),
+        Statistics(*steps.costs, completed_steps=end.completed, rejected_steps=rejected),
         model.leave(end.state),
         result,
     )

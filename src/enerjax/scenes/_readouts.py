@@ -21,8 +21,10 @@ from ._parameters import Parameters
 
 
 class Readout(NamedTuple):
-    """What a part measures, shape `(times,)`, of one state `()`; of a part that acts on a
-    point (`Load`, `Follower`, `ConstantForce`, `Position`) `(times, d)`, in space.
+    """What a part measures.
+
+    Shape `(times,)`, of one state `()`; of a part that acts on a point (`Load`,
+    `Follower`, `ConstantForce`, `Position`) `(times, d)`, in space.
 
     - `value`: a length, an angle (radians), or a place (a vector of lengths).
     - `rate`: its rate (length per time, radians per time).
