@@ -6,6 +6,7 @@ of them fails, and must leave the others as they were.
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -38,7 +39,10 @@ SCHEMES: dict[str, Callable[[Any], ej.AbstractScheme]] = {
     "kappa": ej.KappaDecaying,
 }
 # Which schemes want velocities that are the rates of the coordinates.
-RATES_ONLY = ("consistent", "consistent 6", "consistent zero", "rattle")
+RATES_ONLY = (
+    "consistent", "consistent 6", "consistent zero", "rattle", "generalized",
+    "generalized ggl",
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,17 +89,19 @@ def family(name: str) -> Family:
 
 
 def pairs() -> list[tuple[str, str]]:
-    """Bodies with every scheme that takes them, halved steps with some."""
-    made = []
-    for name in SCHEMES:
-        made.append((name, "net"))
-        if name not in RATES_ONLY:
-            made += [(name, "top"), (name, "body")]
-    made += [(name, "canonical") for name in ("consistent", "decaying", "consistent 6")]
-    made += [(name, "halved") for name in ("preserving", "decaying", "consistent")]
-    # Neighbours differ, so that a short run sees many of each.
-    stride = next(k for k in (13, 11, 17) if np.gcd(k, len(made)) == 1)
-    return [made[k * stride % len(made)] for k in range(len(made))]
+    """Families in turn, each with the schemes that take it; halved steps with some."""
+    turning = [name for name in reversed(SCHEMES) if name not in RATES_ONLY]
+    by_family = {
+        "halved": ["preserving", "decaying", "consistent"],
+        "top": ["decaying", *(name for name in turning if name != "decaying")],
+        "canonical": ["consistent", "decaying", "consistent 6"],
+        "body": turning[::-1],
+        "net": list(SCHEMES),
+    }
+    turns = itertools.zip_longest(*by_family.values())
+    families = itertools.cycle(by_family)
+    made = zip(itertools.chain.from_iterable(turns), families, strict=False)
+    return [(scheme, name) for scheme, name in made if scheme is not None]
 
 
 def cases(rng: Generator, number: int) -> Iterator[tuple[str, Callable[[], Result]]]:
@@ -177,11 +183,10 @@ def check(rng: Generator, programs: Programs, name: str) -> Result:
         if not okay[lane]:
             continue
         wrong = abs(forward[lane] - reverse[lane]) / size[lane]
-        off = (abs(difference[lane] - reverse[lane]) - 0.1 * apart[lane]) / size[lane]
-        off = max(off, 0.0) if smooth[lane] else 0.0
+        off = abs(difference[lane] - reverse[lane]) / size[lane] if smooth[lane] else 0.0
         measures["forward"] = max(measures.get("forward", 0.0), float(wrong))
         measures["differences"] = max(measures.get("differences", 0.0), float(off))
-        if not (wrong <= 1e-8 and off <= 1e-6):
+        if not (wrong <= 1e-8 and off <= 1e-6 + 0.1 * apart[lane] / size[lane]):
             numbers = f"{reverse[lane]:.9e}, {forward[lane]:.9e}, {difference[lane]:.9e}"
             parts = f"halvings {np.max(halvings[lane])}, size {size[lane]:.1e}"
             found.append(f"lane {lane}: reverse, forward, differences {numbers}, {parts}")

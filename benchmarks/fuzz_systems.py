@@ -20,7 +20,7 @@ from scipy.integrate import solve_ivp
 import enerjax as ej
 
 
-STEPS, FINER, DRAWS = 12, 16, 6
+STEPS, FINER, DRAWS = 12, 16, 18
 SIZES = (8, 20, 40, 80)
 # Each with the order that its error shows, and whether it keeps an account of the energy.
 SCHEMES: dict[str, tuple[Callable[[float], ej.AbstractScheme], int, bool]] = {
@@ -47,11 +47,10 @@ FLOOR = 1e-9  # of the extent of the motion, below which errors are round-off
 
 
 def cases(rng: Generator, number: int) -> Iterator[tuple[str, Callable[[], Result]]]:
-    """A scheme and a size, without constraints in every third round."""
-    turn, place = divmod(number, len(ORDER))
+    """A scheme and a size, without constraints in every fifth block."""
     # Neighbours differ in both, so that a short run sees many of each.
-    name, n = ORDER[(place * 5) % len(ORDER)]
-    free = turn % 3 == 2
+    name, n = ORDER[(number * 5) % len(ORDER)]
+    free = number % 5 == 3
     for draw in range(DRAWS):
         alpha = (0.0, 0.3, 1.0)[draw % 3]
         label = f"{name}, n = {n}" + (", free" if free else "")
@@ -65,11 +64,11 @@ def check(rng: Generator, name: str, n: int, free: bool, alpha: float) -> Result
     system = common.FREE if free else common.CONSTRAINED
     args = common.random_args(rng, n, convex)
     start = ej.initial_state(system, *common.random_start(rng, n, args), args)
-    pace = rng.choice([0.1, CALM, 0.7])
+    pace = rng.choice([0.1, CALM, 0.7, 2.0])
     h = float(pace / fastest(start, args))
     make, order, accounts = SCHEMES[name]
-    if name == "kappa" and alpha == 0.0:
-        alpha = 0.1
+    if name in ("kappa", "decaying index3") and alpha == 0.0:
+        alpha = 0.1  # both are known to stop or to lock there
     scheme = make(alpha)
     runs = [simulate(system, scheme, start, args, h, part) for part in (1, 2, FINER)]
     about = f"alpha {alpha}, h omega {pace}, {'convex' if convex else 'bent'}"
@@ -150,7 +149,7 @@ def ends(runs, truth, start, order, pace, measures) -> Iterator[str]:
     text = "errors " + " ".join(f"{x:.1e}" for x in errors)
     if pace <= CALM:
         measures["error"] = float(np.max(np.where(failed, 0, errors)))
-    if errors[2] > max(0.02, FLOOR):
+    if errors[2] > (0.3 if order == 1 else 0.02):
         yield f"the finer run is far from the explicit solver: {text}"
     for error, bad in zip(errors[:2], failed[:2], strict=True):
         # Half of the order that the scheme has.
