@@ -60,7 +60,7 @@ def _net(rng: Generator):
 
 
 def _shake(rng: Generator, args: Any) -> Any:
-    return jax.tree.map(lambda x: x * np.exp(0.3 * rng.normal(size=jnp.shape(x))), args)
+    return jax.tree.map(lambda x: x * np.exp(0.03 * rng.normal(size=jnp.shape(x))), args)
 
 
 def _turning(problem: Callable[[], Any], low: float, high: float):
@@ -154,9 +154,9 @@ def draw(rng: Generator, name: str) -> Any:
 
 def check(rng: Generator, programs: Programs, name: str) -> Result:
     lanes = [draw(rng, name) for _ in range(LANES)]
-    flat = np.stack([ravel_pytree(p)[0] for p in lanes])
+    flat = jnp.stack([ravel_pytree(p)[0] for p in lanes])
     unravel = jax.vmap(ravel_pytree(lanes[0])[1])
-    along = rng.normal(size=flat.shape) * np.maximum(np.abs(flat), 1e-3)
+    along = jnp.asarray(rng.normal(size=flat.shape)) * jnp.maximum(jnp.abs(flat), 1e-3)
     (value, (okay, halvings)), gradient = programs.reverse(unravel(flat))
     by_lane = np.asarray(jax.vmap(lambda x: ravel_pytree(x)[0])(gradient))
     reverse = np.sum(by_lane * along, axis=1)
