@@ -101,9 +101,9 @@ def show(rows: list[dict[str, Any]]) -> None:
 
 
 def run(
-    seed: int, seconds: float, kinds: tuple[str, ...], number: int | None
+    seed: int, seconds: float, kinds: tuple[str, ...], number: int | None, path: Path
 ) -> list[Done]:
-    """Blocks of the kinds, the one next that has had the least time."""
+    """Blocks of the kinds, the one next that has had the least time; saved one by one."""
     used, next_block = dict.fromkeys(kinds, 0.0), dict.fromkeys(kinds, number or 0)
     all_done: list[Done] = []
     begin = time.monotonic()
@@ -114,7 +114,11 @@ def run(
             all_done.append(done)
             for line in lines(done):
                 print(line, flush=True)
-        used[kind] += time.monotonic() - start
+        took = time.monotonic() - start
+        used[kind] += took
+        print(f"{kind}, block {next_block[kind]}: {took:.0f} s", flush=True)
+        if number is None:
+            save(all_done, seed, path)
         next_block[kind] += 1
         if number is not None or time.monotonic() - begin > seconds:
             return all_done
@@ -145,10 +149,8 @@ def main() -> None:
     os.environ["XLA_FLAGS"] = f"{FLAGS} {os.environ.get('XLA_FLAGS', '')}".strip()
     jax.config.update("jax_enable_x64", True)
     kinds = (asked.only,) if asked.only else KINDS
-    all_done = run(asked.seed, 60 * asked.minutes, kinds, asked.block)
-    show(table(all_done))
-    if asked.block is None:
-        save(all_done, asked.seed, asked.out / "fuzz.json")
+    path = asked.out / "fuzz.json"
+    show(table(run(asked.seed, 60 * asked.minutes, kinds, asked.block, path)))
 
 
 if __name__ == "__main__":
