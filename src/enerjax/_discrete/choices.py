@@ -13,7 +13,8 @@ from .transform import at_a, at_b, increment, Moving, NoRule, Switching, Value
 
 def share(change: Array, squares: Array, decided: Array) -> Array:
     """`change`, as a linear function of the increments of what decided it."""
-    happens = change != 0
+    # Where nothing moves a change is round-off, and none of it is anyone's.
+    happens = (change != 0) & (squares != 0)
     weight = jnp.where(happens, change.astype(float) / jnp.where(happens, squares, 1), 0)
     return (weight * decided).astype(change.dtype)
 

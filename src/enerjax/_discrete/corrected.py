@@ -47,7 +47,8 @@ def _closed(
     defect = significant(defect, size + own)
     # Both operands of the quotient are guarded: under autodiff the branch that `where`
     # does not take is multiplied by zero, and must be finite for that.
-    length2 = jnp.where(defect != 0, d @ along, 1.0)
+    length2 = d @ along
+    length2 = jnp.where((defect != 0) & (length2 != 0), length2, 1.0)
     return mean + defect / length2 * along
 
 
