@@ -15,7 +15,8 @@ from ._types import Count, Scalar
 class Statistics(eqx.Module):
     """What a run cost.
 
-    - `newton_iterations`: of each step, shape `(num_steps,)`; 0 after a failure.
+    - `newton_iterations`: of each step, shape `(num_steps,)`; 0 after a failure. Those of
+      all stages together where a step has several (`Composed`).
     - `residual`: of each step, the largest entry of the step equations, scaled to order
       one, before the last correction; of the step that failed what Newton came to.
     - `halvings`: of each step, how often it had to be halved; see `simulate`.
@@ -41,7 +42,9 @@ class Statistics(eqx.Module):
 
 
 class Solution(eqx.Module):
-    """A run. Every array has a leading axis of saved times; row 0 is the start.
+    """A run. Every array has a leading axis of saved times.
+
+    Row 0 is the start, unless other times were requested.
 
     - `ts`: shape `(times,)`, from `t0` on (time).
     - `ys`: a `State` with `q` of shape `(times, nq)` and `v` of shape `(times, nv)`.
