@@ -72,7 +72,8 @@ def roughness(
     of an energy, without derivatives.
     """
     is_increment = lambda x: isinstance(x, Increment)
-    ends = lambda z: jax.tree.leaves(z, is_leaf=is_increment)[-1].rate
+    leaves = lambda z: jax.tree.leaves(z, is_leaf=is_increment)
+    ends = lambda z: list(filter(is_increment, leaves(z)))[-1].rate
     rates = jnp.concatenate([ends(added)[None], ends(before)]) * coordinate[None]
     second = jnp.diff(rates, n=2, axis=0)
     sizes = jnp.stack([jnp.linalg.norm(x) for x in (second[0], second[0] - second[1])])
@@ -87,15 +88,17 @@ def local_error(sizes: Float[Array, "stages 2"], order: int) -> Scalar:
     constants of Gauss' methods.
     """
     second, third = sizes.T
-    angle = jnp.where(second > 0, third / jnp.where(second > 0, second, 1), 0)
+    angle = third / jnp.where(second > 0, second, 1)
+    angle = jnp.maximum(angle, _LEAST_ANGLE)  # of a method of order 1 it is divided by
     better = jnp.where(angle > _RESOLVED, 1.0, angle ** (order - 2) / _BETTER[order])
     return jnp.sum(better * second) / 6
 
 
-# An angle in a step beyond which no order helps.
+# An angle in a step beyond which no order helps, and one that is not told from none.
 _RESOLVED = 1.2
+_LEAST_ANGLE = 1e-3
 # The error of the midpoint rule over that of a method of this order, at an angle of one.
-_BETTER = {2: 1.0, 3: 6.0, 4: 60.0, 6: 8400.0, 8: 2.1e6}
+_BETTER = {1: 1.0, 2: 1.0, 3: 6.0, 4: 60.0, 6: 8400.0, 8: 2.1e6}
 
 
 def shortened(flight: PyTree[Any], part: float) -> PyTree[Any]:
