@@ -24,7 +24,7 @@ def test_the_estimate_follows_the_error_of_an_oscillator(scheme):
         error = np.max(np.abs(run.ys.q[:, 0] - exact)[-60:])
         # Truncation, of the estimate: the errors span eight orders, and the first steps,
         # which have no past, are taken for worse than they are.
-        assert 0.3 * error < run.phase_error < 50 * error
+        assert 0.3 * error < run.phase_error < 20 * error
     unresolved = ej.simulate(
         system, scheme, ej.State([1.0], [0.0]), h=10.0, num_steps=STEPS, throw=False
     )

@@ -64,39 +64,46 @@ def scales_like(
 
 
 def roughness(
-    coordinate: Coordinates, added: PyTree[Any], before: PyTree[Any]
-) -> Float[Array, " 2"]:
+    coordinate: Coordinates, added: PyTree[Any], before: PyTree[Any], unit: PyTree[Any]
+) -> Float[Array, " 3"]:
     """How large the second and the third difference of velocities are, from step to step.
 
     Of what steps add to a free flight, this one and the three before: in the square root
-    of an energy, without derivatives.
+    of an energy, without derivatives. And the second in parts of that of the step, by the
+    units of the unknowns.
     """
     is_increment = lambda x: isinstance(x, Increment)
     leaves = lambda z: jax.tree.leaves(z, is_leaf=is_increment)
     ends = lambda z: list(filter(is_increment, leaves(z)))[-1].rate
-    rates = jnp.concatenate([ends(added)[None], ends(before)]) * coordinate[None]
-    second = jnp.diff(rates, n=2, axis=0)
-    sizes = jnp.stack([jnp.linalg.norm(x) for x in (second[0], second[0] - second[1])])
-    return jax.lax.stop_gradient(sizes)
+    rates = jnp.concatenate([ends(added)[None], ends(before)])
+    new, old = jnp.diff(rates, n=2, axis=0)
+    size = lambda x: jnp.linalg.norm(x * coordinate)
+    # The larger of two: a difference that passes through zero is no sign of anything.
+    second = jnp.maximum(size(new), size(old))
+    part = jnp.linalg.norm(new / ends(unit))
+    return jax.lax.stop_gradient(jnp.stack([second, size(new - old), part]))
 
 
-def local_error(sizes: Float[Array, "stages 2"], order: int) -> Scalar:
+def local_error(sizes: Float[Array, "stages 3"], order: int) -> Scalar:
     """What a step is off by, in velocities, as the square root of an energy.
 
     Of the trapezoidal rule a sixth of the second difference. Methods of higher order are
     better by powers of the angle in a step, which the third difference tells, and by the
-    constants of Gauss' methods.
+    constants of Gauss' methods; not where the motion is not resolved: where differences
+    alternate, and a step is off by a good part of its velocities.
     """
-    second, third = sizes.T
-    angle = third / jnp.where(second > 0, second, 1)
-    angle = jnp.maximum(angle, _LEAST_ANGLE)  # of a method of order 1 it is divided by
-    better = jnp.where(angle > _RESOLVED, 1.0, angle ** (order - 2) / _BETTER[order])
+    second, third, part = sizes.T
+    angle = jnp.clip(third / jnp.where(second > 0, second, 1), _LEAST_ANGLE, 2.0)
+    resolved = (angle < _RESOLVED) | (part < _CALM)
+    better = jnp.where(resolved, angle ** (order - 2) / _BETTER[order], 1.0)
     return jnp.sum(better * second) / 6
 
 
-# An angle in a step beyond which no order helps, and one that is not told from none.
+# An angle in a step beyond which no order helps, and one that is not told from none (a
+# method of order 1 divides by it); and the size of a second difference that is no noise.
 _RESOLVED = 1.2
 _LEAST_ANGLE = 1e-3
+_CALM = 0.3
 # The error of the midpoint rule over that of a method of this order, at an angle of one.
 _BETTER = {1: 1.0, 2: 1.0, 3: 6.0, 4: 60.0, 6: 8400.0, 8: 2.1e6}
 

@@ -173,7 +173,7 @@ def solve(
         jax.tree.map(_pushed, root.factors, memory.factors),
         end.carried,
     )
-    rough = roughness(model.scales.coordinate, added, memory.added)
+    rough = roughness(model.scales.coordinate, added, memory.added, unknown_scale)
     return Solved(end, root.iterations, root.residual, result, rough, after)
 
 
