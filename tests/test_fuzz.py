@@ -26,7 +26,7 @@ def no_findings(results):
 @pytest.mark.parametrize(
     ("scheme", "n", "free"),
     [
-        ("decaying", 8, False),
+        pytest.param("decaying", 8, False, marks=pytest.mark.slow),
         pytest.param("consistent", 8, False, marks=pytest.mark.slow),
         pytest.param("composed 4", 20, False, marks=pytest.mark.slow),
         pytest.param("decaying", 40, False, marks=pytest.mark.slow),

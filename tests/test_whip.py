@@ -45,6 +45,7 @@ def test_the_runs_of_figures_10_and_11_are_whole_and_undivided():
     assert lost[30] < 0.05 * lost[-1]
 
 
+@pytest.mark.slow
 def test_what_has_no_solution_is_divided_and_told():
     run = whip(ej.EnergyDecaying(0.0), 0.01, max_halvings=4)
     check(run, 0.01, 0.0)
