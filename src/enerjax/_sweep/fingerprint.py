@@ -11,6 +11,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from .grid import Grid
+from .hashing import add_array, checksum
 
 
 def fingerprint(grid: Grid, chunks: np.ndarray, traced: Any) -> dict[str, str]:
@@ -19,8 +20,7 @@ def fingerprint(grid: Grid, chunks: np.ndarray, traced: Any) -> dict[str, str]:
     for name, values in grid.values.items():
         word.update(repr((name, str(jax.tree.structure(values)))).encode())
         for x in jax.tree.leaves(values):
-            word.update(repr((x.shape, str(x.dtype))).encode())
-            word.update(np.ascontiguousarray(x).tobytes())
+            add_array(word, x)
     order = hashlib.sha256(repr(chunks.shape).encode() + chunks.astype(np.int64).tobytes())
     return {
         "parameters": word.hexdigest(),
@@ -48,7 +48,7 @@ def _read(jaxpr: Jaxpr, consts: Any, tell: Callable) -> None:
         else names.setdefault(atom, len(names))
     )
     for const in consts:
-        _read_array(const, tell)
+        tell(checksum([const]))
     tell([(name(x), str(x.aval)) for x in (*jaxpr.constvars, *jaxpr.invars)])
     for eqn in jaxpr.eqns:
         tell(eqn.primitive.name, [name(x) for x in eqn.invars])
@@ -57,11 +57,6 @@ def _read(jaxpr: Jaxpr, consts: Any, tell: Callable) -> None:
             _read_parameter(eqn.params[key], tell)
         tell([(name(x), str(x.aval)) for x in eqn.outvars])
     tell([name(x) for x in jaxpr.outvars])
-
-
-def _read_array(array: Any, tell: Callable) -> None:
-    array = np.asarray(array)
-    tell(array.shape, str(array.dtype), hashlib.sha256(array.tobytes()).hexdigest())
 
 
 def _read_parameter(value: Any, tell: Callable) -> None:
@@ -83,7 +78,7 @@ def _read_parameter(value: Any, tell: Callable) -> None:
     elif isinstance(value, bool | int | float | complex | str | bytes | np.dtype):
         tell(value)
     elif isinstance(value, np.ndarray | np.generic | jax.Array):
-        _read_array(value, tell)
+        tell(checksum([value]))
     elif isinstance(value, types.FunctionType):
         _read_function(value, tell)
     elif isinstance(getattr(value, "jaxpr", None), Jaxpr):

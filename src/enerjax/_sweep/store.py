@@ -1,15 +1,16 @@
 """Results on disk, chunk by chunk: a sweep that was killed goes on where it stopped."""
 
-import hashlib
 import io
 import json
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+
+from .hashing import checksum
 
 
 # Seconds after which a draft that nobody writes to is what a killed process left.
@@ -59,7 +60,7 @@ class Store:
         try:
             with np.load(io.BytesIO(data)) as content:
                 arrays = [content[f"arr_{k}"] for k in range(len(content.files) - 1)]
-                is_whole = str(content["sha256"]) == _checksum(arrays)
+                is_whole = str(content["sha256"]) == checksum(arrays)
         # (A damaged archive raises errors of a dozen types.)
         except Exception:
             is_whole, arrays = False, []
@@ -72,7 +73,7 @@ class Store:
         return arrays
 
     def write(self, chunk: int, arrays: list[np.ndarray]) -> None:
-        word = np.array(_checksum(arrays))
+        word = np.array(checksum(arrays))
         self._put(self._file(chunk), lambda file: np.savez(file, *arrays, sha256=word))
 
     def _file(self, chunk: int) -> Path:
@@ -100,11 +101,3 @@ class Store:
                         draft.unlink()
                 except FileNotFoundError:
                     pass  # Its process has finished it, or another has removed it.
-
-
-def _checksum(arrays: Sequence[np.ndarray]) -> str:
-    word = hashlib.sha256()
-    for array in arrays:
-        word.update(repr((array.shape, str(array.dtype))).encode())
-        word.update(np.ascontiguousarray(array).tobytes())
-    return word.hexdigest()
