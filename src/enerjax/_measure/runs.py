@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from .._check import check_system, positive_integer
-from .._results import RESULTS
+from .._results import meanings, RESULTS
 from .._schemes import AbstractScheme
 from .._solution import Solution
 from .._system import AbstractSystem, State
@@ -139,8 +139,7 @@ def _run(
         return Run(failure=f"refused: {_first_sentence(str(error))}")
     if solution.result != RESULTS.successful:
         at = task.t0 + int(solution.stats.completed_steps) * task.duration / num_steps
-        cause = _first_sentence(RESULTS[solution.result]).split(":")[0]
-        return Run(failure=f"failed at t = {at:.4g}: {cause}")
+        return Run(failure=f"failed at t = {at:.4g}: {meanings(solution.result)}")
     seconds = [_timed(task, scheme, num_steps) for _ in range(repeats)]
     errors = _errors(task, exact, solution, num_steps)
     return Run(

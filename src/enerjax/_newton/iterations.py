@@ -171,7 +171,7 @@ def _attempt(
 
 
 class _Size(NamedTuple):
-    """Of a correction, what it has left of the one before, and the residual it is from."""
+    """The size of a correction, in parts of the one before too, and of its residual."""
 
     size: Scalar
     contraction: Scalar

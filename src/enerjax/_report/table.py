@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .._results import RESULTS
+from .._results import meanings
 from .runs import Run
 
 
@@ -52,7 +52,7 @@ def outcome(run: Run) -> str:
     """How a run ended, in a few words."""
     if run.failed:
         done = int(run.solution.stats.completed_steps)
-        cause = RESULTS[run.solution.result].split(".")[0].split(":")[0]
+        cause = meanings(run.solution.result)
         return f"failed in step {done + 1} (t = {done * run.case.h:.4g}): {cause}"
     followed = _followed(run)
     if followed < 0.05:
