@@ -15,6 +15,7 @@ from .._system import AbstractSystem, State, System
 from .._tracing import is_known
 from .._types import Args, Flag, Scalar
 from .shapes import describe, energies
+from .values import direction_without_symmetry
 
 
 # Round-off of gradients and differences of them, in units of that of their entries.
@@ -108,8 +109,7 @@ def _tried(
 ) -> tuple[Flag, Flag]:
     """Whether `D(a, a)` is the gradient, and `D(a, b)` directional."""
     eps = _ROUND_OFF * jnp.finfo(x.dtype).eps
-    along = 1 + 0.5 * jnp.cos(jnp.arange(x.size, dtype=x.dtype))
-    near = x + _APART * (1 + jnp.abs(x)) * along
+    near = x + _APART * (1 + jnp.abs(x)) * direction_without_symmetry(x)
     both = lambda x: (derivative.gradient(fn, x, x), jax.grad(fn)(x))
     discrete, exact = jax.lax.map(both, jnp.stack([x, near]))
     # At an equilibrium the gradient vanishes, and its terms do not: how it changes tells.

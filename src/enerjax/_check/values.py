@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .._linear import blocks_of, Symmetric
 from .._system import (
@@ -16,6 +16,11 @@ from .._system import (
 from .._tracing import is_known
 from .._types import Args
 from .shapes import describe, energies
+
+
+def direction_without_symmetry(x: Float[Array, " n"]) -> Float[Array, " n"]:
+    """A direction in which what depends on `x` is unlikely to stay as it is."""
+    return 1 + 0.5 * jnp.cos(jnp.arange(x.size, dtype=x.dtype))
 
 
 @eqx.filter_jit
@@ -33,8 +38,8 @@ def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]
         constraints.append(system.coordinate_constraint)
     potential = lambda q: system.potential_energy(State(q, jnp.zeros_like(state.v)), args)
     held = [lambda q, fn=fn: fn(q, args) for fn in constraints if fn is not None]
-    # Along a direction without symmetry, in which a row changes if it depends on `q`.
-    along = 1 + 0.5 * jnp.cos(jnp.arange(state.q.size, dtype=state.q.dtype))
+    # A row that depends on `q` changes along this direction.
+    along = direction_without_symmetry(state.q)
     rates = [jax.jvp(fn, (state.q,), (along,))[1] for fn in held]
     slopes = jnp.concatenate([jnp.zeros((0,), state.q.dtype), *rates])
     timed, t = [], state.t

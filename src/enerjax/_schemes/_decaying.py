@@ -23,7 +23,7 @@ class JumpAndEnd(eqx.Module):
 
 def as_alpha(alpha: Real) -> Scalar:
     """Checks a dissipation parameter where its value can be known."""
-    alpha, inside = _unit_interval(alpha)
+    alpha, inside = _unit_interval("alpha", alpha)
     if not inside:
         raise ValueError(
             f"alpha = {alpha} lies outside [0, 1]: 0 preserves the energy, 1 annihilates "
@@ -32,12 +32,10 @@ def as_alpha(alpha: Real) -> Scalar:
     return alpha
 
 
-def _unit_interval(number: Real) -> tuple[Scalar, bool]:
+def _unit_interval(name: str, number: Real) -> tuple[Scalar, bool]:
     """A number as an array, and whether it may lie in [0, 1] as far as is known."""
     if isinstance(number, str) or jnp.iscomplexobj(number):
-        raise TypeError(
-            f"The dissipation of a scheme must be a real number in [0, 1], got {number!r}."
-        )
+        raise TypeError(f"`{name}` must be a real number in [0, 1], got {number!r}.")
     if not is_known(number):
         return jnp.asarray(number, float), True
     # A constant keeps its value inside `jit` too.
@@ -48,7 +46,7 @@ def _unit_interval(number: Real) -> tuple[Scalar, bool]:
 
 def alpha_from_spectral_radius(rho_inf: Real) -> Scalar:
     """`alpha = (1 - rho_inf) / (1 + rho_inf)`"""
-    rho_inf, inside = _unit_interval(rho_inf)
+    rho_inf, inside = _unit_interval("rho_inf", rho_inf)
     if not inside:
         raise ValueError(
             f"rho_inf = {rho_inf} lies outside [0, 1]: it is the factor by which a step "

@@ -83,6 +83,14 @@ def _like(old: Mapping[str, Any], key: str, value: Any) -> Any:
 class _ReadOnly(Mapping):
     """What is found by name, and changed with `Parameters.set` alone."""
 
+    _entries: Mapping[str, Any]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
     def __setitem__(self, key: str, value: Any) -> NoReturn:
         _refuse(key)
 
@@ -104,17 +112,11 @@ class _Section(_ReadOnly):
 
     def __init__(self, parameters: Parameters, section: str):
         self._tables = parameters.tables[section]
-        self._places = parameters.layout.places[section]
+        self._entries = parameters.layout.places[section]
 
     def __getitem__(self, name: str) -> "_Part":
-        group, row = self._places[name]
+        group, row = self._entries[name]
         return _Part(jax.tree.map(lambda table: table[row], self._tables[group]))
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._places)
-
-    def __len__(self) -> int:
-        return len(self._places)
 
     def __repr__(self) -> str:
         return "\n".join(f"{name}: {part}" for name, part in self.items())
@@ -125,22 +127,16 @@ class _Part(_ReadOnly):
     """The numbers of one part; a tree of them, as a dictionary is."""
 
     def __init__(self, numbers: Numbers):
-        self._numbers = numbers
+        self._entries = numbers
 
     def __getitem__(self, name: str) -> Any:
-        return self._numbers[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._numbers)
-
-    def __len__(self) -> int:
-        return len(self._numbers)
+        return self._entries[name]
 
     def __repr__(self) -> str:
         return ", ".join(f"{name} = {_told(x)}" for name, x in self.items())
 
     def tree_flatten(self) -> tuple[tuple[Numbers], None]:
-        return (self._numbers,), None
+        return (dict(self._entries),), None
 
     @classmethod
     def tree_unflatten(cls, _: None, numbers: tuple[Numbers]) -> "_Part":
