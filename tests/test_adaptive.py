@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import enerjax as ej
-from enerjax._model import make_model
+from enerjax._operators import make_model
 from enerjax._run.collocation import rates
 from enerjax._run.controller import other_end
 

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from enerjax._linear.columns import columns_along, jacobian_columns
-from enerjax._linear.dense import inverse
+from enerjax._programs.sparsity.columns import columns_along, jacobian_columns
+from enerjax._solvers.linear.dense import inverse
 
 
 X = jnp.linspace(0.2, 0.8, 6)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import enerjax as ej
-from enerjax._linear.dense import Inverse
+from enerjax._solvers.linear.dense import Inverse
 
 from .helpers import EPS
 

@@ -11,10 +11,10 @@ import pytest
 from scipy.sparse import csr_array
 
 import enerjax as ej
-from enerjax._linear.banded import Band
-from enerjax._linear.blocks import BlockDiagonal, hessian, inverse_of
-from enerjax._linear.jacobian import RowPattern
-from enerjax._linear.pattern import jacobian_pattern
+from enerjax._programs.sparsity.pattern import jacobian_pattern
+from enerjax._solvers.linear.banded import Band
+from enerjax._solvers.linear.blocks import BlockDiagonal, hessian, inverse_of
+from enerjax._solvers.linear.jacobian import RowPattern
 
 from .helpers import EPS, SCHEMES
 
@@ -74,7 +74,7 @@ def test_the_pattern_covers_the_jacobian(name):
 
 def test_a_pattern_that_is_too_full_is_none(monkeypatch):
     """A system of such functions runs all the same, densely."""
-    monkeypatch.setattr("enerjax._linear.dependence._TOO_MANY", 1000)
+    monkeypatch.setattr("enerjax._programs.sparsity.dependence._TOO_MANY", 1000)
     size = 40
     mixed = lambda x: jnp.sin(jnp.cumsum(x))
     assert jacobian_pattern(mixed, jnp.ones(size)) is None

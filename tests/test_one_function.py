@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from jax.ad_checkpoint import checkpoint_name
 
-from enerjax._linear.dense import Inverse
-from enerjax._one_function import in_one_function, marks, possible, unmerged
-from enerjax._tracing import programs_within
+from enerjax._programs import in_one_function, unmerged
+from enerjax._programs.one_function import marks, possible
+from enerjax._programs.tracing import programs_within
+from enerjax._solvers.linear.dense import Inverse
 
 
 pytestmark = pytest.mark.skipif(

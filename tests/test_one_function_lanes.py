@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 import enerjax as ej
-from enerjax._linear import eigh
-from enerjax._newton import Newton
-from enerjax._one_function import in_one_function
-from enerjax._root import find_root
-from enerjax._tracing import programs_within
+from enerjax._programs import in_one_function
+from enerjax._programs.tracing import programs_within
+from enerjax._solvers import eigh, find_root, Newton
 
 from .test_one_function import is_marked, pytestmark, X
 

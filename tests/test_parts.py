@@ -7,16 +7,16 @@ import pytest
 
 import enerjax as ej
 from enerjax import problems
-from enerjax._kinematics import ConfigurationKinematics
-from enerjax._linear import (
+from enerjax._operators import make_model, SeparableModel
+from enerjax._programs import jacobian_pattern
+from enerjax._solvers import (
     constant_entries,
     inverse,
-    jacobian_pattern,
     multiply_parts,
     parts_of,
     solve_parts,
 )
-from enerjax._model import make_model, SeparableModel
+from enerjax._system.kinematics import ConfigurationKinematics
 
 
 # Two ones, one by one, two by two and three by three, rows and columns shuffled.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import enerjax as ej
-from enerjax._one_function import in_one_function
+from enerjax._programs import in_one_function
 
 from .test_one_function import is_marked, pytestmark
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import enerjax as ej
-from enerjax._linear.blocks import BlockDiagonal
-from enerjax._linear.pattern import jacobian_pattern
+from enerjax._programs.sparsity.pattern import jacobian_pattern
+from enerjax._solvers.linear.blocks import BlockDiagonal
 
 from .helpers import solve
 

@@ -8,11 +8,10 @@ from jax.flatten_util import ravel_pytree
 from scipy.sparse import csr_array
 
 import enerjax as ej
-from enerjax._linear.banded import Band
-from enerjax._linear.pattern import jacobian_pattern
-from enerjax._model import SeparableModel
-from enerjax._newton import Newton
-from enerjax._root import find_root
+from enerjax._operators import SeparableModel
+from enerjax._programs.sparsity.pattern import jacobian_pattern
+from enerjax._solvers import find_root, Newton
+from enerjax._solvers.linear.banded import Band
 
 from .helpers import EPS, SCHEMES
 

@@ -2,15 +2,16 @@ from importlib.metadata import version as _version
 
 from . import problems as problems
 from ._analysis import (
+    consistent_start as consistent_start,
+    ConsistentStart as ConsistentStart,
     Equilibrium as Equilibrium,
     equilibrium as equilibrium,
+    initial_state as initial_state,
     Mobility as Mobility,
     mobility as mobility,
     Modes as Modes,
     modes as modes,
 )
-from ._audit import Audit as Audit
-from ._diffrax import IndexReduced as IndexReduced, to_diffrax as to_diffrax
 from ._discrete import (
     AbstractDerivative as AbstractDerivative,
     ChainRule as ChainRule,
@@ -21,47 +22,34 @@ from ._discrete import (
     Gonzalez as Gonzalez,
     MeanValue as MeanValue,
 )
-from ._energies import Energies as Energies
-from ._fast_loops import enable_fast_loops as enable_fast_loops
-from ._identify import (
-    Fit as Fit,
-    fit as fit,
-    MultipleShooting as MultipleShooting,
-)
-from ._initial import (
-    consistent_start as consistent_start,
-    ConsistentStart as ConsistentStart,
-    initial_state as initial_state,
-)
-from ._linear import KLU as KLU
-from ._measure import (
-    order_table as order_table,
-    OrderTable as OrderTable,
-    work_precision as work_precision,
-    WorkPrecision as WorkPrecision,
-)
-from ._newton import Newton as Newton
+from ._programs import enable_fast_loops as enable_fast_loops
 from ._results import RESULTS as RESULTS
-from ._run import simulate as simulate, StepController as StepController
-from ._schemes import (
-    AbstractScheme as AbstractScheme,
-    Composed as Composed,
-    EnergyConsistent as EnergyConsistent,
-    EnergyDecaying as EnergyDecaying,
-    EnergyPreserving as EnergyPreserving,
-    GeneralizedAlpha as GeneralizedAlpha,
-    KappaDecaying as KappaDecaying,
-    Rattle as Rattle,
+from ._run import (
+    Audit as Audit,
+    simulate as simulate,
+    Solution as Solution,
+    Statistics as Statistics,
+    step as step,
+    StepController as StepController,
+    StepOutput as StepOutput,
+    Warm as Warm,
 )
-from ._solution import Solution as Solution, Statistics as Statistics
-from ._step import step as step, StepOutput as StepOutput, Warm as Warm
-from ._sweep import Sweep as Sweep, sweep as sweep
+from ._solvers import KLU as KLU, Newton as Newton
 from ._system import (
     AbstractSystem as AbstractSystem,
     Elements as Elements,
     State as State,
     System as System,
 )
+from ._tools.diffrax import IndexReduced as IndexReduced, to_diffrax as to_diffrax
+from ._tools.identify import Fit as Fit, fit as fit, MultipleShooting as MultipleShooting
+from ._tools.measure import (
+    order_table as order_table,
+    OrderTable as OrderTable,
+    work_precision as work_precision,
+    WorkPrecision as WorkPrecision,
+)
+from ._tools.sweep import Sweep as Sweep, sweep as sweep
 from .scenes import (
     bodies as bodies,
     drives as drives,
@@ -72,6 +60,17 @@ from .scenes import (
     Reaction as Reaction,
     Readout as Readout,
     Scene as Scene,
+)
+from .schemes import (
+    AbstractScheme as AbstractScheme,
+    Composed as Composed,
+    Energies as Energies,
+    EnergyConsistent as EnergyConsistent,
+    EnergyDecaying as EnergyDecaying,
+    EnergyPreserving as EnergyPreserving,
+    GeneralizedAlpha as GeneralizedAlpha,
+    KappaDecaying as KappaDecaying,
+    Rattle as Rattle,
 )
 
 

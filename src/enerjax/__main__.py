@@ -12,7 +12,7 @@ from pathlib import Path
 
 import jax
 
-from ._fast_loops import enable_fast_loops
+from ._programs import enable_fast_loops
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
@@ -55,7 +55,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = _parse(arguments)
     jax.config.update("jax_enable_x64", True)
     # Not before the options are known to be good: this import takes the longest.
-    from ._report import figures, runs, table
+    from ._tools.report import figures, runs, table
 
     done = runs.run_all(options.quick, _progress)
     table.write_csv(done, options.out / "table.csv")

@@ -8,13 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._check import check_system
-from .._linear import largest
-from .._model import AbstractModel, make_model
-from .._newton import Newton
-from .._root import find_root, RootFinder
-from .._system import AbstractSystem, HamiltonianSystem, State
-from .._tracing import is_known
+from .._operators import AbstractModel, make_model
+from .._programs import is_known
+from .._solvers import find_root, largest, Newton, RootFinder
+from .._system import AbstractSystem, check_system, HamiltonianSystem, State
 from .._types import Args, Coordinates, Flag, Multipliers, Real, Scalar
 
 

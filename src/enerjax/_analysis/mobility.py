@@ -9,10 +9,9 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float
 
-from .._check import check_system
-from .._linear import as_dense
-from .._model import make_model
-from .._system import AbstractSystem, State
+from .._operators import make_model
+from .._solvers import as_dense
+from .._system import AbstractSystem, check_system, State
 from .._types import Args, Real
 
 

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._linear import as_dense, cholesky, eigh, inverse
-from .._model import make_model
+from .._operators import make_model
+from .._programs import is_known
+from .._solvers import as_dense, cholesky, eigh, inverse
 from .._system import AbstractSystem, State
-from .._tracing import is_known
 from .._types import Args, Coordinates, Real, Scalar
 from .equilibrium import at_rest
 from .mobility import independent_rows, scaled_constraints

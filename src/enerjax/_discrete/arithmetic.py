@@ -9,19 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._tracing import evaluate, is_known
+from .._programs import evaluate, is_known
 from . import elementary
-from .transform import (
-    at_a,
-    at_b,
-    increment,
-    moves,
-    Moving,
-    NoRule,
-    Rule,
-    Switching,
-    Value,
-)
+from .transform import at_a, at_b, increment, moves, Moving, NoRule, Rule, Switching, Value
 
 
 def both(values: list[Value], params: dict[str, Any]) -> list[tuple[Array, Array]]:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from .._tracing import evaluate
+from .._programs import evaluate
 from .base import significant
 from .choices import share
 from .transform import at_a, at_b, Moving, Switching, Value

@@ -15,16 +15,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from .arithmetic import both
-from .transform import (
-    at_a,
-    at_b,
-    increment,
-    moves,
-    Moving,
-    NoRule,
-    Switching,
-    Value,
-)
+from .transform import at_a, at_b, increment, moves, Moving, NoRule, Switching, Value
 
 
 def _transposed(x: Array) -> Array:

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array
 
-from .._tracing import (
+from .._programs import (
     evaluate,
     function_with_own_derivative,
     interpret,

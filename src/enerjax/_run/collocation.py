@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._model import AbstractModel, Time
+from .._operators import AbstractModel, Time
 from .._system import State
 from .._types import Coordinates, Scalar, Velocities
 

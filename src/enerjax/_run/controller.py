@@ -8,17 +8,17 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from .._model import AbstractModel
+from .._operators import AbstractModel
+from .._programs import is_known
 from .._results import RESULTS
-from .._root import ROOT
-from .._schemes import AbstractCarryingSolve, AbstractScheme
-from .._step import StepOutput, Warm
+from .._solvers import ROOT
 from .._system import State
-from .._tracing import is_known
 from .._types import Count, Flag, Real, Scalar
+from ..schemes import AbstractCarryingSolve, AbstractScheme
 from .collocation import end_of, Pair, rates, rates_along
 from .pace import AbstractPace, Verdict
 from .prediction import for_length, with_history
+from .step import StepOutput, Warm
 
 
 def _as_tolerance(tolerance: Real) -> Scalar:

@@ -4,8 +4,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .._model import AbstractModel
-from .._projection import project_position, project_velocity
+from .._analysis import project_position, project_velocity
+from .._operators import AbstractModel
 from .._system import State
 from .._types import Scalar
 from .collocation import end_of, integral, rates, rates_along

@@ -7,11 +7,11 @@ import equinox as eqx
 import jax
 
 from .._analysis import mobility
+from .._programs import is_known
 from .._results import RESULTS
-from .._solution import Solution
 from .._system import AbstractSystem
-from .._tracing import is_known
 from .._types import Args, Scalar
+from .solution import Solution
 
 
 def raise_failure(

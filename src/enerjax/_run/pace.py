@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from .._model import AbstractModel
+from .._operators import AbstractModel
+from .._programs import is_known
 from .._results import RESULTS
-from .._step import StepOutput, Warm
 from .._system import State
-from .._tracing import is_known
 from .._types import Count, Flag, Real, Scalar
+from .step import StepOutput, Warm
 
 
 class Verdict(eqx.Module):

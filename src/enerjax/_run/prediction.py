@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._step import Warm
 from .._types import Scalar
+from .step import Warm
 
 
 def for_length(

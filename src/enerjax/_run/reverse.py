@@ -15,9 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from .._lanes import anywhere
-from .._one_function import in_one_function
-from .._root import ROOT
+from .._programs import anywhere, in_one_function
+from .._solvers import ROOT
 
 
 # Steps beyond which the roots are not kept.

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._energies import Energies
-from .._model import AbstractModel
+from .._operators import AbstractModel
 from .._system import State
 from .._types import Count, Flag, Multipliers, Scalar, Times
+from ..schemes import Energies
 from .dense_output import Bracket, state_within
 from .selection import nan_unless
 

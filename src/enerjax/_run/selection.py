@@ -3,11 +3,11 @@
 import jax
 import jax.numpy as jnp
 
-from .._model import AbstractModel
+from .._operators import AbstractModel
 from .._results import RESULTS
-from .._schemes import AbstractScheme
 from .._system import State
 from .._types import Flag, Scalar
+from ..schemes import AbstractScheme
 
 
 def select(good: Flag, new, old):

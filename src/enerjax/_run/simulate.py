@@ -5,21 +5,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._audit import audit
-from .._check import check_form, check_halvings, positive_integer, prepare
-from .._model import make_model
-from .._newton import Newton
+from .._operators import make_model
 from .._results import first_failure, RESULTS
-from .._root import RootFinder
-from .._schemes import AbstractScheme
-from .._solution import Solution, Statistics
-from .._step import advance, first_warm, Warm
+from .._solvers import Newton, RootFinder
 from .._system import AbstractSystem, State
 from .._types import Args, Count, Flag, Real, Vector
+from ..schemes import AbstractScheme
+from .audit import audit
 from .controller import StepController
 from .failure import memory_told, raise_failure
+from .inputs import check_halvings, positive_integer, prepare
 from .reverse import keep_roots, scans
 from .selection import check_start, nan_unless, select
+from .solution import Solution, Statistics
+from .step import advance, first_warm, Warm
+from .times import check_form
 from .to_time import simulate_until
 
 

@@ -7,22 +7,23 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from .._audit import audit
-from .._check import bound_on_steps, check_times, prepare
-from .._model import make_model
+from .._operators import make_model
 from .._results import first_failure, RESULTS
-from .._root import RootFinder
-from .._schemes import AbstractScheme
-from .._solution import Solution, Statistics
-from .._step import advance, first_warm, Warm
+from .._solvers import RootFinder
 from .._system import AbstractSystem, State
 from .._types import Args, Count, Flag, Multipliers, Real, Scalar, Times
+from ..schemes import AbstractScheme
+from .audit import audit
 from .controller import controlled, StepController
 from .failure import raise_failure
+from .inputs import prepare
 from .pace import AbstractPace, EqualSteps, steps_that_fit
 from .reverse import keep_roots, scan_until
 from .rows import at_both_ends, at_steps, at_times, Run, Step
 from .selection import check_start, select
+from .solution import Solution, Statistics
+from .step import advance, first_warm, Warm
+from .times import bound_on_steps, check_times
 
 
 class _Carry(eqx.Module):

@@ -9,5 +9,16 @@ from .canonical import (
     HamiltonianSystem as HamiltonianSystem,
     LagrangianSystem as LagrangianSystem,
 )
+from .checks.shapes import describe as describe, energies as energies
+from .checks.system import (
+    check_not_mixed as check_not_mixed,
+    check_number as check_number,
+    check_system as check_system,
+)
+from .checks.values import direction_without_symmetry as direction_without_symmetry
 from .elements import Elements as Elements
+from .kinematics import (
+    AbstractKinematics as AbstractKinematics,
+    IdentityKinematics as IdentityKinematics,
+)
 from .separable import System as System

@@ -28,15 +28,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._linear import Symmetric
-from .._types import (
-    Args,
-    Coordinates,
-    JointMultipliers,
-    Multipliers,
-    Scalar,
-    Velocities,
-)
+from .._solvers import Symmetric
+from .._types import Args, Coordinates, JointMultipliers, Multipliers, Scalar, Velocities
 
 
 def inexact(x: Any) -> Array:

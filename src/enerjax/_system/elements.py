@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._linear import Indices
+from .._programs import Indices
 from .._types import Args, Coordinates
 
 

@@ -5,23 +5,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from .._kinematics import (
-    AbstractKinematics,
-    ConfigurationKinematics,
-    IdentityKinematics,
-)
-from .._linear import BlockDiagonal, hessian, in_blocks, Symmetric
+from .._solvers import BlockDiagonal, hessian, in_blocks, Symmetric
 from .._types import Args, Coordinates, Multipliers, Scalar, Velocities
-from .base import (
-    AbstractSystem,
-    check_function,
-    Driven,
-    Force,
-    inexact,
-    State,
-    Symmetry,
-)
+from .base import AbstractSystem, check_function, Driven, Force, inexact, State, Symmetry
 from .canonical import HamiltonianSystem, LagrangianSystem
+from .kinematics import AbstractKinematics, ConfigurationKinematics, IdentityKinematics
 
 
 class System(AbstractSystem):

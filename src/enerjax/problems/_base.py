@@ -1,6 +1,6 @@
 from typing import NamedTuple
 
-from .._initial import initial_state
+from .._analysis import initial_state
 from .._system import AbstractSystem, State
 from .._types import Args, Vector
 from ..scenes import Scene

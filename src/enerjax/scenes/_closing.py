@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._initial import start_near
+from .._analysis import start_near
+from .._programs import is_known
 from .._system import State, System
-from .._tracing import is_known
 from .._types import Real
 from ._functions import drives_at
 from ._gaps import by_name, Measured, measured

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._tracing import is_known
+from .._programs import is_known
 from .._types import Coordinates
 from ._frames import Frame, GROUND, Numbers
 from ._hinges import Hinge, Hinges

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._tracing import is_known
+from .._programs import is_known
 
 
 # The angle between two axes, below which they are parallel.

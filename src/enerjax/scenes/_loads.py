@@ -9,12 +9,7 @@ from .._types import Args, Real, Scalar, Vector
 from ._forces import AbstractForce
 from ._frames import GROUND, Numbers
 from ._laws import Acting, Following, Viscous
-from ._measures import (
-    AbstractLaw,
-    Place,
-    Separation,
-    turn_of,
-)
+from ._measures import AbstractLaw, Place, Separation, turn_of
 from ._numbers import number
 from ._own import takes_view
 from ._start import Ends

@@ -10,14 +10,7 @@ from .._types import Coordinates, Scalar, Vector, Velocities
 from ._frames import Numbers, Point
 from ._laws import AbstractPush, AbstractStored, Alignment, Driven, Length
 from ._layout import Layout, Links
-from ._measures import (
-    AbstractLaw,
-    AbstractMeasure,
-    PlanarTurn,
-    Separation,
-    Slide,
-    Turn,
-)
+from ._measures import AbstractLaw, AbstractMeasure, PlanarTurn, Separation, Slide, Turn
 from ._parameters import Parameters
 from ._view import evaluate, lift, View
 

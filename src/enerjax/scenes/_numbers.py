@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from .._tracing import is_known
+from .._programs import is_known
 
 
 def module_of(*values: Any) -> ModuleType:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._tracing import is_known
+from .._programs import is_known
 from ._frames import Numbers
 from ._layout import Layout
 

@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._analysis import Equilibrium
-from .._initial import ConsistentStart
+from .._analysis import ConsistentStart, Equilibrium
 from .._system import State
 from .._types import Real, Scalar
 from ._functions import at_time, pushes

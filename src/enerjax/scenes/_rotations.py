@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from .._tracing import is_known
+from .._programs import is_known
 from ._frames import Numbers
 from ._numbers import module_of, number, positive
 

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._tracing import is_known
+from .._programs import is_known
 from ._frames import Frame, Numbers
 from ._hinges import Hinges
 from ._numbers import basis, direction, module_of, number

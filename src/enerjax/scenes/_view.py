@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._tracing import is_known
+from .._programs import is_known
 from .._types import Coordinates, Scalar, Vector, Velocities
 from ._frames import Frame, Point
 from ._layout import Layout, Links

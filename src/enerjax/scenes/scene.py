@@ -7,11 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._analysis import Equilibrium, freedoms, Mobility
-from .._initial import ConsistentStart
-from .._solution import Solution
+from .._analysis import ConsistentStart, Equilibrium, freedoms, Mobility
+from .._programs import is_known
+from .._run import Solution
 from .._system import State, System
-from .._tracing import is_known
 from .._types import Coordinates, Real, Vector
 from ._closing import check_poses, closed_start, gaps_of, Told
 from ._compile import compile_parts, join, sort_parts

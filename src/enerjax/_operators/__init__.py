@@ -1,0 +1,21 @@
+from .._system import AbstractCanonicalSystem, AbstractSystem, State, System
+from .._types import Args
+from .base import AbstractModel as AbstractModel
+from .canonical import CanonicalModel as CanonicalModel
+from .interval import Drive as Drive, Increment as Increment, Time as Time
+from .scaling import (
+    local_error as local_error,
+    roughness as roughness,
+    scales_like as scales_like,
+    shortened as shortened,
+)
+from .separable import SeparableModel as SeparableModel
+from .sizes import force_size as force_size
+
+
+def make_model(system: AbstractSystem, state: State, args: Args) -> AbstractModel:
+    """The model of a system; `state`, as the user has it, sets the scales."""
+    if isinstance(system, AbstractCanonicalSystem):
+        return CanonicalModel(system, state, args)
+    assert isinstance(system, System)
+    return SeparableModel(system, state, args)

@@ -1,0 +1,190 @@
+"""Programs in other words, where these are possible in one function.
+
+Products of matrices become sums of products. Entries that are put or added to places which
+are known when the program is traced, as derivatives of `x[indices]` are, are picked from
+there: XLA has no scattering inside of one function, but gathering.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.core import Tracer
+from jax.extend.core import ClosedJaxpr, Literal
+from jaxtyping import Array, Int
+
+from ..tracing import evaluate, interpret, programs_within, wrapped_program
+from .possible import is_small_product, LARGEST_SUM, NAME
+from .products import written_out
+
+
+def rewritten(jaxpr: Any, known: Sequence[np.ndarray | None]) -> ClosedJaxpr:
+    """A program of those numbers alone whose values are not known."""
+    inputs = [*jaxpr.constvars, *jaxpr.invars]
+    rest = [x for x, value in zip(inputs, known, strict=True) if value is None]
+
+    def program(*numbers: Array) -> list[Any]:
+        left = iter(numbers)
+        values = [next(left) if value is None else value for value in known]
+        count = len(jaxpr.constvars)
+        return interpret(jaxpr, values[:count], values[count:], _equation)
+
+    like = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in rest]
+    return jax.make_jaxpr(program)(*like)
+
+
+def as_index(x: Any) -> np.ndarray | None:
+    """An array of indices that is known."""
+    if isinstance(x, Tracer) or jnp.ndim(x) == 0:
+        return None
+    is_whole = getattr(x.dtype, "kind", "key") in "iub"
+    return np.asarray(x, x.dtype) if is_whole else None
+
+
+def _equation(eqn: Any, values: list[Any]) -> list[Any]:
+    values = [_known(*pair) for pair in zip(eqn.invars, values, strict=True)]
+    name, params = eqn.primitive.name, eqn.params
+    whole = all(not jnp.issubdtype(x.aval.dtype, jnp.inexact) for x in eqn.outvars)
+    if whole and all(isinstance(x, np.ndarray) for x in values):
+        with jax.ensure_compile_time_eval():
+            return [np.asarray(x) for x in evaluate(eqn.primitive, values, params)]
+    if _is_at_fault(eqn):
+        if name == "dot_general" and eqn.outvars[0].aval.size <= LARGEST_SUM:
+            left, right = values
+            return [written_out(left, right, params["dimension_numbers"])]
+        if name in _SCATTERS and isinstance(values[1], np.ndarray):
+            return [_scattered(name, values, params)]
+    elif any(map(_has_fault, programs_within(eqn))):
+        if name in _LOOPS:
+            return _LOOPS[name](values, params)
+        inner = wrapped_program(eqn)
+        if inner is not None:
+            return interpret(*inner, values, _equation)
+    return evaluate(eqn.primitive, values, params)
+
+
+def _known(atom: Any, value: Any) -> Any:
+    """An index as an array of NumPy, also where it is written into the program."""
+    if not isinstance(atom, Literal):
+        return value
+    found = np.asarray(atom.val, value.dtype)
+    return value if jnp.issubdtype(found.dtype, jnp.inexact) else found
+
+
+def _is_at_fault(eqn: Any) -> bool:
+    name = eqn.primitive.name
+    return name in _SCATTERS or (name == "dot_general" and not is_small_product(eqn))
+
+
+def _has_fault(jaxpr: Any) -> bool:
+    return any(
+        _is_at_fault(eqn) or any(map(_has_fault, programs_within(eqn)))
+        for eqn in jaxpr.eqns
+        if eqn.primitive.name != NAME
+    )
+
+
+# Loops and branches -----------------------------------------------------------------------
+
+
+def _of(closed: ClosedJaxpr, values: list[Any]) -> list[Any]:
+    out = interpret(closed.jaxpr, closed.consts, values, _equation)
+    return [
+        jnp.asarray(x, aval.dtype) for x, aval in zip(out, closed.out_avals, strict=True)
+    ]
+
+
+def _scan(values: list[Any], params: dict[str, Any]) -> list[Any]:
+    count, inner = params["num_carry"], params["jaxpr"]
+    first = params["num_consts"]
+    consts, carry, rows = np.split(np.arange(len(values)), [first, first + count])
+    pick = lambda numbers: [values[k] for k in numbers]
+
+    def turn(carry, row):
+        out = _of(inner, [*pick(consts), *carry, *row])
+        return out[:count], out[count:]
+
+    how = {key: params[key] for key in ("length", "reverse", "unroll")}
+    carry, rows = lax.scan(turn, pick(carry), pick(rows), **how)
+    return [*carry, *rows]
+
+
+def _while(values: list[Any], params: dict[str, Any]) -> list[Any]:
+    first, second = params["cond_nconsts"], params["body_nconsts"]
+    outer, inner = values[:first], values[first : first + second]
+    goes_on = lambda carry: _of(params["cond_jaxpr"], [*outer, *carry])[0]
+    turn = lambda carry: _of(params["body_jaxpr"], [*inner, *carry])
+    return lax.while_loop(goes_on, turn, list(map(jnp.asarray, values[first + second :])))
+
+
+def _cond(values: list[Any], params: dict[str, Any]) -> list[Any]:
+    number, *operands = values
+    branches = [lambda _, b=branch: _of(b, operands) for branch in params["branches"]]
+    return lax.switch(number, branches, None)
+
+
+_LOOPS = {"scan": _scan, "while": _while, "cond": _cond}
+
+
+# Entries to known places ------------------------------------------------------------------
+
+
+def _scattered(name: str, values: list[Any], params: dict[str, Any]) -> Array:
+    operand, index, updates = values
+    places = _places(operand.shape, index, updates.shape, params)
+    updates, size = jnp.ravel(updates), operand.size
+    if name == "scatter":
+        source, falls = np.arange(size), places >= 0
+        source[places[falls]] = size + np.flatnonzero(falls)
+        return _picked(jnp.append(jnp.ravel(operand), updates), source, operand.shape)
+    order = np.argsort(places, kind="stable")
+    order = order[places[order] >= 0]
+    to = places[order]
+    # How many for the same place come before.
+    before = np.arange(to.size) - np.searchsorted(to, to)
+    source = np.full((1 + before.max(initial=-1), size), updates.size)
+    source[before, to] = order
+    updates = jnp.append(updates, jnp.zeros((), updates.dtype))
+    for row in source:
+        operand = operand + _picked(updates, row, operand.shape)
+    return operand
+
+
+_SCATTERS = frozenset(("scatter", "scatter-add"))
+# Where that can be.
+REWRITTEN = _SCATTERS | {"dot_general"}
+
+
+def _picked(flat: Array, source: np.ndarray, shape: tuple[int, ...]) -> Array:
+    return flat.at[source].get(mode="promise_in_bounds").reshape(shape)
+
+
+def _places(
+    shape: tuple[int, ...], index: np.ndarray, of_updates: tuple[int, ...], params: Any
+) -> Int[np.ndarray, " updates"]:
+    """Where in a flat array each of some flat updates falls; below zero for nowhere."""
+    dims, grid = params["dimension_numbers"], np.indices(of_updates)
+    windows, shared = dims.update_window_dims, dims.operand_batching_dims
+    at = [grid[k] for k in range(len(of_updates)) if k not in windows]
+    starts = index[tuple(at)]
+    skipped = (*dims.inserted_window_dims, *shared)
+    inner = [k for k in range(len(shape)) if k not in skipped]
+    first, within = np.zeros((2, len(shape), *of_updates), int)
+    room = np.array(shape) - 1
+    for axis, k in zip(inner, windows, strict=True):
+        within[axis] = grid[k]
+        room[axis] -= of_updates[k] - 1
+    for k, axis in enumerate(dims.scatter_dims_to_operand_dims):
+        first[axis] = starts[..., k]
+    for axis, k in zip(shared, dims.scatter_indices_batching_dims, strict=True):
+        first[axis] = at[k]
+    room = room.reshape(-1, *[1] * len(of_updates))
+    if params["mode"] == lax.GatherScatterMode.CLIP:
+        first = np.clip(first, 0, room)
+    falls = np.all((first >= 0) & (first <= room), axis=0)
+    strides = np.cumprod([1, *shape[:0:-1]])[::-1]
+    places = np.tensordot(strides[: len(shape)], first + within, 1)
+    return np.where(falls, places, -1).ravel()

@@ -1,0 +1,134 @@
+"""Energies, momenta and constraint residuals along a run, to judge it by."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._operators import AbstractModel
+from .._programs import is_known
+from .._system import State
+from ..schemes import Energies
+
+
+class Audit(eqx.Module):
+    """What a run did to the energy and to the constraints, at each saved time.
+
+    `print(solution.audit)` tells it in short.
+
+    - `kinetic`, `potential`, `energy`: shape `(times,)` (energy).
+    - `dissipated`: shape `(times,)`, the energy that the scheme removed since the row
+      before, by its own identity; 0 in row 0.
+    - `work`, `drive_work`: shape `(times,)`, the work of `force` (dampers included) and
+      that of `driven` constraints on the system since the row before; 0 where the system
+      has none. Joints do no work: their discrete gradient is orthogonal to what they hold.
+    - `damped`: shape `(times,)`, what dampers took: the work, with the other sign, of the
+      part of `force` that changes sign with the velocity, `(f(q, v, t) - f(q, -v, t))/2`.
+    - `leak`: shape `(times,)`, what this leaves of the change of the energy since the row
+      before, `energy[k] = energy[k-1] + work[k] + drive_work[k] - dissipated[k] + leak[k]`:
+      round-off, what Newton left, and what a scheme without an energy identity loses on
+      joints. Not of the size of round-off: do not believe the run.
+    - `momentum`: shape `(times, ns)`, of each `symmetry` of the system.
+    - `constraint`: shape `(times, nc)`, residuals of the constraints: joints, driven ones,
+      relations between coordinates, in their own units.
+    - `constraint_rate`: shape `(times, nj)`, residuals of joints and driven constraints
+      at velocity level.
+    """
+
+    kinetic: Float[Array, " times"]
+    potential: Float[Array, " times"]
+    dissipated: Float[Array, " times"]
+    work: Float[Array, " times"]
+    damped: Float[Array, " times"]
+    drive_work: Float[Array, " times"]
+    momentum: Float[Array, "times ns"]
+    constraint: Float[Array, "times nc"]
+    constraint_rate: Float[Array, "times nj"]
+
+    @property
+    def energy(self) -> Float[Array, " times"]:
+        return self.kinetic + self.potential
+
+    @property
+    def leak(self) -> Float[Array, " times"]:
+        change = jnp.diff(self.energy, prepend=self.energy[..., :1])
+        return change - self.work - self.drive_work + self.dissipated
+
+    def __str__(self) -> str:
+        return _report(self) if is_known(self) else repr(self)
+
+
+def audit(
+    model: AbstractModel,
+    states: State,
+    energies: Energies,
+) -> Audit:
+    """The audit of states, and of the energies between them, with a leading time axis."""
+
+    def at(state: State):
+        return (
+            model.kinetic(state),
+            model.potential(state),
+            model.symmetry_momenta(state),
+            model.constraint(state.q, state.t),
+            model.joint_rate(state.q, state.v, state.t),
+        )
+
+    kinetic, potential, momentum, constraint, rate = jax.vmap(at)(states)
+    # Where a row is not a number, none of its entries is.
+    none = 0 * energies.dissipated
+    return Audit(
+        kinetic,
+        potential,
+        energies.dissipated,
+        none if energies.work is None else energies.work,
+        none if energies.damped is None else energies.damped,
+        none if energies.drive_work is None else energies.drive_work,
+        momentum,
+        constraint,
+        rate,
+    )
+
+
+def _report(audit: Audit) -> str:
+    """One line for each kind of entry; of a batch the worst lane."""
+    rows = np.isfinite(np.asarray(audit.energy))
+    kept = lambda x: np.where(rows, np.asarray(x), 0.0)
+    total = lambda x: _worst(np.sum(kept(x), axis=-1))
+    largest = lambda x: np.nanmax(np.abs(np.asarray(x)), initial=0.0)
+    momentum = np.asarray(audit.momentum)
+    lines = [
+        ("energy, change over the run", _worst(_last(audit.energy) - audit.energy[..., 0])),
+        ("  removed by the scheme", total(audit.dissipated)),
+        ("  work of forces", total(audit.work)),
+        ("    of these, taken by dampers", total(audit.damped)),
+        ("  work of drives", total(audit.drive_work)),
+        ("  unaccounted for (sum)", total(audit.leak)),
+        ("  unaccounted for (largest row)", largest(audit.leak)),
+        ("largest kinetic energy", largest(audit.kinetic)),
+        ("constraints, largest residual", largest(audit.constraint)),
+        ("  of velocities", largest(audit.constraint_rate)),
+    ]
+    for k in range(momentum.shape[-1]):
+        drift = momentum[..., k] - momentum[..., :1, k]
+        lines.append((f"momentum {k}, largest change", largest(drift)))
+    done = rows.sum(axis=-1)
+    what = f"{rows.shape[-1]} rows" + (
+        "" if rows.all() else f", {done.min()} of them before a failure"
+    )
+    if rows.ndim > 1:
+        what += f", the worst of {rows[..., 0].size} runs"
+    width = max(len(name) for name, _ in lines)
+    return "\n".join([what, *(f"{name:{width}}  {x: .3e}" for name, x in lines)])
+
+
+def _last(x: Array) -> np.ndarray:
+    """The last entry of each lane that is a number."""
+    last = np.isfinite(np.asarray(x)).sum(axis=-1) - 1
+    return np.take_along_axis(np.asarray(x), last[..., None], axis=-1)[..., 0]
+
+
+def _worst(x: np.ndarray) -> float:
+    flat = np.ravel(x)
+    return float(flat[np.argmax(np.abs(flat))])

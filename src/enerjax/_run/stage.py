@@ -1,0 +1,241 @@
+"""One solve of the step equations: predict, find the root, finish.
+
+Here the physics scales what Newton sees: rates by the inertia, multipliers by the
+gradients of their constraints, and everything by an energy of the step.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, PyTree
+
+from .._operators import AbstractModel, Increment, roughness, scales_like, shortened
+from .._results import first_failure, from_root_finder, RESULTS
+from .._solvers import (
+    AbstractFactors,
+    find_root,
+    kept_factors,
+    max_norm,
+    RootFinder,
+    RowPattern,
+)
+from .._system import State
+from .._types import Count, Flag, Multipliers, Scalar, Velocities
+from ..schemes import (
+    AbstractCarryingSolve,
+    AbstractSimplifiedSolve,
+    AbstractSingleSolve,
+    StepEnd,
+)
+
+
+# Enough for the linear convergence of a locking step; a step that needs more has failed.
+MAX_ITERATIONS = 50
+
+
+class Memory(eqx.Module):
+    """What the last steps leave for a solve.
+
+    - `added`: what the last three steps added to a free flight, newest first.
+    - `is_smooth`: whether extrapolating from these would have met the last step better
+      than repeating.
+    - `factors`: of the Jacobians of the last three steps, newest first.
+    - `carried`: what a scheme with a memory hands on; of others `None`.
+    """
+
+    added: PyTree[Any]
+    is_smooth: Flag
+    factors: AbstractFactors | None
+    carried: PyTree[Any]
+
+
+class Solved(eqx.Module):
+    """A solve, done or failed.
+
+    - `end`: what it leads to.
+    - `iterations`: of Newton.
+    - `residual`: largest entry of the step equations, scaled to order one, before the last
+      correction.
+    - `result`: whether, and how, it failed.
+    - `roughness`: differences of velocities from step to step; see `_operators/scaling.py`.
+    - `memory`: for the next.
+    """
+
+    end: StepEnd
+    iterations: Count
+    residual: Scalar
+    result: RESULTS
+    roughness: Array
+    memory: Memory
+
+
+def first_memory(
+    scheme: AbstractSingleSolve,
+    model: AbstractModel,
+    start: State,
+    h: Scalar,
+    acceleration: Velocities,
+    multipliers: Multipliers,
+) -> Memory:
+    """The memory of a run that begins."""
+    carried = None
+    if isinstance(scheme, AbstractCarryingSolve):
+        carried = scheme.begin(model, start, h, acceleration)
+    problem = _problem(scheme, model, start, h, carried)
+    z = scheme.predict(problem, acceleration, multipliers)
+    flight = _free_flight(scheme, problem, model, start)
+    added = jax.tree.map(lambda x, x0: jnp.stack([x - x0] * 3), z, flight)
+    added = jax.lax.stop_gradient(added)
+    flat, _ = ravel_pytree(flight)
+    factors = kept_factors(flat.size, flat.dtype)
+    factors = jax.tree.map(lambda x: jnp.stack([x] * 3), factors)
+    return Memory(added, jnp.array(True), factors, carried)
+
+
+def _problem(
+    scheme: AbstractSingleSolve,
+    model: AbstractModel,
+    start: State,
+    h: Scalar,
+    carried: PyTree[Any],
+) -> Any:
+    """The data of a step."""
+    problem = scheme.problem(model, start, h)
+    if isinstance(scheme, AbstractCarryingSolve):
+        return scheme.resume(problem, carried)
+    return problem
+
+
+def solve(
+    scheme: AbstractSingleSolve,
+    model: AbstractModel,
+    start: State,
+    h: Scalar,
+    memory: Memory,
+    root_finder: RootFinder,
+    skip: Flag,
+) -> Solved:
+    """A step of length `h` of a scheme; with `skip` it costs no iteration."""
+    problem = _problem(scheme, model, start, h, memory.carried)
+    flight = _free_flight(scheme, problem, model, start)
+    unknown_scale, row_scale, least = scales_like(flight, model, start, h)
+
+    def scaled(x, inputs):
+        scheme, problem, unknown_scale, row_scale = inputs
+        z = jax.tree.map(jnp.multiply, x, unknown_scale)
+        return jax.tree.map(jnp.divide, scheme.residual(z, problem), row_scale)
+
+    def simplified(x, held, inputs):
+        scheme, problem, unknown_scale, row_scale = inputs
+        assert isinstance(scheme, AbstractSimplifiedSolve)
+        z, held = (jax.tree.map(jnp.multiply, x, unknown_scale) for x in (x, held))
+        rows = scheme.simplified(z, held, problem)
+        return jax.tree.map(jnp.divide, rows, row_scale)
+
+    inputs = (scheme, problem, unknown_scale, row_scale)
+
+    # Smooth motion is met by extrapolation; where it changes quickly the last step is
+    # the better guess. What would have been better for the step before decides.
+    smooth = jax.tree.map(_next, memory.added)
+    last = jax.tree.map(lambda x: x[0], memory.added)
+    choose = lambda x, y: jnp.where(memory.is_smooth, x, y)
+    added = jax.tree.map(choose, smooth, last)
+    guess = jax.tree.map(lambda x0, x, s: (x0 + x) / s, flight, added, unknown_scale)
+    scale_down = lambda z: jax.tree.map(jnp.divide, z, unknown_scale)
+    root = find_root(
+        scaled,
+        root_finder,
+        guess,
+        inputs,
+        max_iterations=MAX_ITERATIONS,
+        # What the last steps suggest can lie beyond a fold of the step equations, a flight
+        # without force on the near side, or where rods turn far in it, a part of that.
+        others=[scale_down(shortened(flight, part)) for part in (1.0, 0.5, 0.25)],
+        factors=jax.tree.map(_next, memory.factors),
+        skip=skip,
+        fill=_fill(model, unknown_scale, row_scale),
+        least=least,
+        simplified=simplified if isinstance(scheme, AbstractSimplifiedSolve) else None,
+    )
+    z = jax.tree.map(jnp.multiply, root.value, unknown_scale)
+    end = scheme.finish(z, problem)
+    result = from_root_finder(root.found, root.broken, root.finite)
+    turned = RESULTS.where(
+        _turns(model, start, end.state), RESULTS.step_too_large, RESULTS.successful
+    )
+    result = first_failure(first_failure(end.result, result), turned)
+    added = jax.lax.stop_gradient(jax.tree.map(jnp.subtract, z, flight))
+    off = lambda x: max_norm(
+        jax.tree.map(lambda x, y, unit: (x - y) / unit, added, x, unknown_scale)
+    )
+    after = Memory(
+        jax.tree.map(_pushed, added, memory.added),
+        off(smooth) <= off(last),
+        jax.tree.map(_pushed, root.factors, memory.factors),
+        end.carried,
+    )
+    rough = roughness(model.scales.coordinate, added, memory.added, unknown_scale)
+    return Solved(end, root.iterations, root.residual, result, rough, after)
+
+
+def _next(x: Array) -> Array:
+    """What follows the last three, newest first, on a parabola."""
+    return 3 * x[0] - 3 * x[1] + x[2]
+
+
+def _pushed(new: Array, old: Array) -> Array:
+    """The last three, one step later."""
+    return jnp.stack([new, old[0], old[1]])
+
+
+def _turns(model: AbstractModel, a: State, b: State) -> Flag:
+    """Whether the gradient of a joint turns by more than a right angle from `a` to `b`.
+
+    A solution of the step equations on the other side of a joint satisfies the joint too.
+    """
+    if model.system.constraint is None:
+        return jnp.array(False)
+    rows = RowPattern(model.fixed, a.q)
+    unit = model.scales.coordinate[rows.columns]
+    before, after = (
+        rows.derivative(model.fixed, jax.lax.stop_gradient(q)) / unit for q in (a.q, b.q)
+    )
+    return jnp.any(jnp.sum(before * after, axis=1) < 0)
+
+
+def _with_multipliers(z: PyTree[Any], values: PyTree[Any]) -> PyTree[Any]:
+    """Unknowns with the multipliers of others."""
+    parts = lambda x: (x.impulse, x.velocity_impulse)
+    is_increment = lambda x: isinstance(x, Increment)
+    change = lambda x, y: eqx.tree_at(parts, x, parts(y)) if is_increment(x) else x
+    return jax.tree.map(change, z, values, is_leaf=is_increment)
+
+
+def _fill(model: AbstractModel, unknown_scale: Any, row_scale: Any) -> Any | None:
+    """What makes the step equations regular where constraints repeat each other.
+
+    Weighed by the scales of row and unknown, so that the multipliers of least norm are
+    those of least norm in the measure of their constraints.
+    """
+    if not model.system.redundant:
+        return None
+
+    def weigh(unit: Array, row: Array) -> Array:
+        product = unit * row
+        share = jnp.min(product, initial=jnp.inf) / product
+        return share * jnp.asarray(model.fill(unit.size, unit.dtype))
+
+    none = jax.tree.map(jnp.zeros_like, unknown_scale)
+    return _with_multipliers(none, jax.tree.map(weigh, unknown_scale, row_scale))
+
+
+def _free_flight(
+    scheme: AbstractSingleSolve, problem: Any, model: AbstractModel, start: State
+) -> PyTree[Any]:
+    """The unknowns of a step in which no force acts."""
+    num_constraints = jax.eval_shape(model.constraint, start.q, start.t).shape[0]
+    no_force = jnp.zeros((num_constraints,), start.q.dtype)
+    return scheme.predict(problem, jnp.zeros_like(start.v), no_force)

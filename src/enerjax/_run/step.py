@@ -1,0 +1,205 @@
+"""One step: a solve, or a chain of solves.
+
+This is the layer where solves are counted.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from .._operators import AbstractModel, local_error, make_model
+from .._programs import in_one_function
+from .._results import first_of, RESULTS
+from .._solvers import largest, Newton, RootFinder
+from .._system import AbstractSystem, State
+from .._types import Args, Coordinates, Count, Flag, Multipliers, Real, Scalar, Velocities
+from ..schemes import AbstractScheme, Energies
+from .halving import solve_or_divide
+from .inputs import check_halvings, prepare
+from .stage import first_memory, Memory
+
+
+class Warm(eqx.Module):
+    """What the last steps leave for the next.
+
+    Pass it from one `step` to the next, with the same `h`, to start Newton closer.
+
+    - `stages`: for each stage, stacked.
+    - `rest`: what the rounding of `q` has withheld from it so far, less than its last
+      digit. Added to the next displacement, it does not accumulate: bodies far from the
+      origin keep the energy as well as others.
+    """
+
+    stages: Memory
+    rest: Coordinates
+
+
+class StepOutput(eqx.Module):
+    """One step, done or failed.
+
+    - `state`: at the end of the step; meaningless if the step failed.
+    - `multipliers`: `lambda` of the step, `(nc,)`, of joints, driven constraints and
+      relations between coordinates, in this order.
+    - `energies`: what the scheme removed, and what `force` and `driven` constraints
+      brought in.
+    - `details`: what the scheme reports of its own, or `None`.
+    - `newton_iterations`: over all solves of the step.
+    - `residual`: of the step equations, see `Statistics`.
+    - `halvings`: how often the step, or a stage of it, was halved.
+    - `local_error`: an estimate; see `Statistics`.
+    - `result`: a `RESULTS`; compare it with `RESULTS.successful`.
+    - `warm`: pass it to the next step.
+    """
+
+    state: State
+    multipliers: Multipliers
+    energies: Energies
+    details: PyTree[Any]
+    newton_iterations: Count
+    residual: Scalar
+    halvings: Count
+    local_error: Scalar
+    result: RESULTS
+    warm: Warm
+
+
+def first_warm(
+    scheme: AbstractScheme,
+    model: AbstractModel,
+    start: State,
+    h: Scalar,
+    acceleration: Velocities,
+    multipliers: Multipliers,
+) -> Warm:
+    """The memory of a run that begins: every stage predicted from the start."""
+
+    def first(length):
+        return first_memory(
+            scheme.stage, model, start, length * h, acceleration, multipliers
+        )
+
+    lengths = jnp.asarray(scheme.stages, h.dtype)
+    return Warm(jax.vmap(first)(lengths), jnp.zeros_like(start.q))
+
+
+def advance(
+    scheme: AbstractScheme,
+    model: AbstractModel,
+    start: State,
+    h: Scalar,
+    warm: Warm,
+    root_finder: RootFinder,
+    skip: Flag,
+    max_halvings: int | None = None,
+) -> StepOutput:
+    """One step of a scheme, without checks. With `skip` it costs no iteration."""
+
+    def stage(carry, stage_input):
+        state, rest = carry
+        length, memory = stage_input
+        solved, halvings = solve_or_divide(
+            scheme.stage,
+            model,
+            state,
+            length * h,
+            memory,
+            root_finder,
+            skip,
+            max_halvings,
+        )
+        end = solved.end
+        costs = (solved.iterations, solved.residual, halvings, solved.roughness)
+        reported = (end.multipliers, end.energies, end.details, costs, solved.result)
+        q, rest = _sum_and_rest(state.q, end.displacement + rest)
+        state = State(q, end.state.v, end.state.t)
+        return (state, rest), (length, reported, solved.memory)
+
+    lengths = jnp.asarray(scheme.stages, h.dtype)
+    begin, inputs = (start, warm.rest), (lengths, warm.stages)
+    (state, rest), (lengths, reported, memory) = jax.lax.scan(stage, begin, inputs)
+    multipliers, energies, details, costs, results = reported
+    iterations, residuals, halvings, sizes = costs
+    return StepOutput(
+        state,
+        # The mean force over the step: stages count by their length, backwards ones too.
+        lengths @ multipliers,
+        jax.tree.map(jnp.sum, energies),
+        jax.tree.map(lambda x: x[-1], details),
+        jnp.sum(iterations),
+        largest(residuals),
+        jnp.max(halvings),
+        local_error(sizes, scheme.order),
+        first_of(results),
+        Warm(memory, rest),
+    )
+
+
+def _sum_and_rest(x: Array, y: Array) -> tuple[Array, Array]:
+    """The rounded sum and what the rounding took, exactly (D. E. Knuth's two-sum)."""
+    total = x + y
+    of_y = total - x
+    rest = (x - (total - of_y)) + (y - of_y)
+    return total, jax.lax.stop_gradient(rest)
+
+
+@eqx.filter_jit
+def _single_step(system, scheme, state, args, h, warm, root_finder, max_halvings):
+    model = make_model(system, state, args)
+    state = model.enter(state)
+    fresh = lambda: first_warm(scheme, model, state, h, *model.accelerations(state))
+    if warm is None:
+        warm = fresh()
+    elif _kinds(warm) != _kinds(eqx.filter_eval_shape(fresh)):
+        raise ValueError(
+            "`warm` is not of this scheme and system. Pass the `warm` of the step before, "
+            "or none."
+        )
+    no = jnp.array(False)
+    go = lambda: advance(scheme, model, state, h, warm, root_finder, no, max_halvings)
+    out = in_one_function(go)()
+    return eqx.tree_at(lambda out: out.state, out, model.leave(out.state))
+
+
+def _kinds(tree: PyTree[Any]) -> Any:
+    leaves, structure = jax.tree.flatten(tree)
+    return structure, [(jnp.shape(x), jnp.result_type(x)) for x in leaves]
+
+
+def step(
+    system: AbstractSystem,
+    scheme: AbstractScheme,
+    state: State,
+    args: Args = None,
+    *,
+    h: Real,
+    t: Real = 0.0,
+    warm: Warm | None = None,
+    root_finder: RootFinder = Newton(),
+    max_halvings: int | None = None,
+) -> StepOutput:
+    """Advance one state by one step of length `h`, for loops of your own.
+
+    Never raises on a failure of the step: look at `result`. All of `state`, `args`, `h`,
+    `t` and the numbers of the scheme are traced, so the function can be put in `jit`,
+    `vmap`, `lax.scan`, `grad` and `jvp`.
+
+    **Arguments:**
+
+    - `system`, `scheme`, `state`, `args`: as for `simulate`. The state must satisfy the
+      constraints; see `initial_state`.
+    - `h`: length of the step (time), positive.
+    - `t`: the time at which the step starts, for `force` and `driven`.
+    - `warm`: `warm` of the step before, if it had the same `h`. Without it the
+      accelerations and multipliers at `state` are computed to predict the step.
+    - `root_finder`, `max_halvings`: see `simulate`.
+
+    **Returns:** a `StepOutput`.
+
+    **Raises:** `ValueError` or `TypeError` for wrong shapes, types and signs.
+    """
+    state, args, h, _ = prepare(system, scheme, state, args, h, t, root_finder)
+    check_halvings(max_halvings)
+    return _single_step(system, scheme, state, args, h, warm, root_finder, max_halvings)

@@ -1,0 +1,37 @@
+"""Newton's method, roots with their derivatives, and linear algebra; no mechanics."""
+
+from .linear.assembled import Assembled as Assembled, row_hessians as row_hessians
+from .linear.blocks import (
+    as_dense as as_dense,
+    BlockDiagonal as BlockDiagonal,
+    blocks_of as blocks_of,
+    hessian as hessian,
+    in_blocks as in_blocks,
+    inverse_of as inverse_of,
+    Symmetric as Symmetric,
+)
+from .linear.dense import (
+    AbstractFactors as AbstractFactors,
+    inverse as inverse,
+    product as product,
+    solve as solve,
+)
+from .linear.given import KLU as KLU
+from .linear.jacobian import (
+    affine_root as affine_root,
+    kept_factors as kept_factors,
+    RowPattern as RowPattern,
+)
+from .linear.norms import largest as largest
+from .linear.parts import (
+    constant_entries as constant_entries,
+    multiply_parts as multiply_parts,
+    Parts as Parts,
+    parts_of as parts_of,
+    solve_parts as solve_parts,
+)
+from .linear.symmetric import cholesky as cholesky, eigh as eigh
+from .newton import Newton as Newton
+from .newton_iterations import max_norm as max_norm
+from .root import find_root as find_root, ROOT as ROOT
+from .search import RootFinder as RootFinder

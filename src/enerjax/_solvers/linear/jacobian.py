@@ -1,0 +1,253 @@
+"""A function with its Jacobian, in the form that suits its size and structure."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+from scipy.sparse import csr_array
+
+from ..._programs import (
+    in_one_function,
+    jacobian_columns,
+    jacobian_pattern,
+    LARGE,
+    plain_products,
+    shape_of,
+)
+from .banded import Band, coloured_products, column_colours
+from .dense import AbstractFactors, Inverse, inverse, LU, SMALL, solve
+from .given import KLU, LineaxFactors, Scattered
+
+
+class Full:
+    """A matrix that is stored as one array.
+
+    Where its pattern is known, columns that share no row are found together.
+    """
+
+    def __init__(
+        self, solver: lx.AbstractLinearSolver | None, pattern: csr_array | None = None
+    ):
+        self.solver = solver
+        self._colours = None
+        if pattern is None:
+            return
+        self._colours = column_colours(pattern, np.arange(shape_of(pattern)[1]))
+        self._filled = pattern.toarray()
+
+    def evaluate(self, fn: Callable[[Array], Array], x: Float[Array, " n"]) -> Array:
+        if self._colours is None:
+            return jacobian_columns(fn, x)
+        columns = coloured_products(fn, x, self._colours)[:, self._colours]
+        return jnp.where(self._filled, columns, 0)
+
+    def empty(self, size: int, dtype: Any) -> AbstractFactors:
+        if self.solver is None:
+            return LU.empty(size, dtype)
+        return LineaxFactors(self.solver, jnp.zeros((size, size), dtype))
+
+
+class Linearisable(eqx.Module):
+    """A function from vectors to vectors, and linear algebra with its Jacobian.
+
+    Made while a program is traced, by `linearisable`. Small and full Jacobians are dense
+    arrays; those that can be ordered into a narrow band are bands.
+    """
+
+    value: Callable[[Float[Array, " n"]], Float[Array, " n"]]
+    form: Full | Band | Scattered
+    # Added to the diagonal of a Jacobian that may be singular.
+    fill: Float[Array, " n"] | None
+    # For a point what stands for the function there, if only the corrections of a search
+    # are solved with its Jacobian.
+    near: Callable[[Array], Callable[[Array], Array]] | None = None
+
+    @property
+    def is_dense(self) -> bool:
+        """Whether its Jacobian is dense, and solved with as this package sees fit."""
+        return isinstance(self.form, Full) and self.form.solver is None
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether `jacobian` is that of `value`."""
+        return self.near is None
+
+    @property
+    def keeps_factors(self) -> bool:
+        """Whether the next iteration can begin with the factors of this one."""
+        return self.is_dense
+
+    def jacobian(self, x: Float[Array, " n"]) -> Array:
+        """The Jacobian, in the form that `first_factors` are renewed with."""
+        fill = self.fill
+        value = self.value if self.near is None else self.near(x)
+        if fill is None:
+            return self.form.evaluate(value, x)
+        return self.form.evaluate(lambda x: value(x) + fill * x, x)
+
+    def first_factors(
+        self, kept: AbstractFactors | None, x: Float[Array, " n"]
+    ) -> AbstractFactors:
+        """What the first Jacobian of an iteration renews."""
+        if kept is not None and self.keeps_factors:
+            return kept
+        return self.form.empty(x.size, x.dtype)
+
+    def solve(self, x: Float[Array, " n"], right: Float[Array, " n"]) -> Array:
+        """`J(x)^-1 right`, differentiable in all there is, and transposable in `right`.
+
+        Of a singular Jacobian with a `fill` the solution without part in its null space.
+        """
+        solve = self.filled_solver(x)
+        first = solve(right)
+        # What a fill has changed is taken back, but for its square.
+        return first if self.fill is None else first + solve(self.fill * first)
+
+    def open_part(
+        self, solve: Callable[[Array], Array], x: Float[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """The part of `x` in the null space of the Jacobian that `solve` solves with,
+        filled.
+
+        Of the rest only the square of what a fill changes is left. Unknowns without a fill
+        are determined: they have no such part.
+        """
+        assert self.fill is not None
+        return jnp.where(self.fill == 0, 0, solve(self.fill * solve(self.fill * x)))
+
+    def filled_solver(self, x: Float[Array, " n"]) -> Callable[[Array], Array]:
+        """Solves with the Jacobian at `x`, filled."""
+        if self.is_dense and self.fill is None and x.size <= SMALL:
+            found = in_one_function(lambda x: inverse(self.jacobian(x)))(x)
+            return lambda right: found @ right
+        matrix = self.jacobian(x)
+        if self.is_dense:
+            # An explicit inverse loses too many digits of what is nearly singular.
+            by = solve if self.fill is None else jnp.linalg.solve
+            return lambda right: by(matrix, right)
+        matrix = jax.lax.stop_gradient(matrix)
+        factors = self.form.empty(x.size, x.dtype).renewed(matrix)
+
+        def product(t: Array) -> Array:
+            image = jax.jvp(self.value, (x,), (t,))[1]
+            return image if self.fill is None else image + self.fill * t
+
+        return lambda right: jax.lax.custom_linear_solve(
+            product,
+            right,
+            lambda _, right: factors.solve(right),
+            # (`linear_transpose` has no rule for what is one function.)
+            lambda _, right: jax.vjp(factors.solve, right)[1](right)[0],
+        )
+
+
+def linearisable(
+    fn: Callable[[Array, PyTree], Array],
+    like: Float[Array, " n"],
+    args: Any,
+    linear_solver: lx.AbstractLinearSolver | KLU | None = None,
+    fill: Float[Array, " n"] | None = None,
+) -> Linearisable:
+    """`fn(x, args)` as a function of `x`; what it depends on must be in `args`.
+
+    Without a `linear_solver` the size and the structure of the Jacobian decide. `fill` is
+    added to its diagonal where it may be singular.
+    """
+    value = plain_products(fn, like, args)
+    if isinstance(linear_solver, lx.AbstractLinearSolver):
+        return Linearisable(value, Full(linear_solver), fill)
+    filled = value if fill is None else lambda x: value(x) + fill * x
+    pattern = jacobian_pattern(filled, like) if like.size > LARGE else None
+    if pattern is None:
+        return Linearisable(value, Full(None), fill)
+    if isinstance(linear_solver, KLU):
+        return Linearisable(value, Scattered(pattern), fill)
+    band = Band(pattern)
+    form = band if band.worth_it() else Full(None, pattern)
+    return Linearisable(value, form, fill)
+
+
+def affine_root(
+    fn: Callable[[Array], Array],
+    like: Float[Array, " n"],
+    fill: Float[Array, " n"] | None = None,
+) -> Float[Array, " n"]:
+    """Where an affine function vanishes; differentiable in what it closes over.
+
+    With a `fill`, which is added to the diagonal, it need not be regular.
+    """
+    at = jnp.zeros_like(like)
+    linear = linearisable(lambda x, _: fn(x), at, None, fill=fill)
+    if linear.is_dense and fill is None:
+        return -jnp.linalg.solve(linear.jacobian(at), linear.value(at))
+    return -linear.solve(at, linear.value(at))
+
+
+def narrowed(
+    exact: Linearisable,
+    simplified: Callable[[Array, tuple[Array, PyTree]], Array],
+    like: Float[Array, " n"],
+    args: Any,
+) -> Linearisable | None:
+    """The same function with the Jacobian of `simplified(x, (x, args))` in the first `x`.
+
+    `None` where that is no narrower band: then nothing is gained.
+    """
+    band = linearisable(simplified, like, (like, args), fill=exact.fill).form
+    if not isinstance(band, Band):
+        return None
+    if isinstance(exact.form, Band) and band.width >= exact.form.width:
+        return None
+    near = lambda held: plain_products(simplified, like, (held, args))
+    return Linearisable(exact.value, band, exact.fill, near)
+
+
+class RowPattern:
+    """Which unknowns each row of a function depends on. Made while a program is traced.
+
+    `columns`: their numbers, shape `(m, width)`; zeros fill short rows.
+    """
+
+    def __init__(self, fn: Callable[[Array], Array], like: Float[Array, " n"]):
+        size = like.size
+        num_rows = jax.eval_shape(lambda x: fn(x), like).shape[0]
+        pattern = jacobian_pattern(lambda x: fn(x), like) if size > LARGE else None
+        if pattern is None:
+            self.columns = np.broadcast_to(np.arange(size), (num_rows, size))
+            self._colours = np.arange(size)
+            self._filled = np.ones((num_rows, size))
+            return
+        self._colours = column_colours(pattern, np.arange(size))
+        counts = np.diff(pattern.indptr)
+        rows = np.repeat(np.arange(num_rows), counts)
+        within = np.arange(rows.size) - np.repeat(pattern.indptr[:-1], counts)
+        self.columns = np.zeros((num_rows, max(counts.max(initial=0), 1)), int)
+        self.columns[rows, within] = pattern.indices
+        self._filled = np.zeros(self.columns.shape)
+        self._filled[rows, within] = 1
+
+    def own(self, x: Float[Array, " n"]) -> Float[Array, "m width"]:
+        """The unknowns of each row; zeros fill short rows."""
+        return x[self.columns] * jnp.asarray(self._filled, x.dtype)
+
+    def derivative(
+        self, fn: Callable[[Array], Array], x: Float[Array, " n"]
+    ) -> Float[Array, "m ... width"]:
+        """Of a function with such rows, `(m, ...)`; zeros where the rows are short."""
+        products = coloured_products(fn, x, self._colours)
+        num_rows, width = self.columns.shape
+        numbers = np.arange(num_rows)
+        entries = products[numbers[:, None], ..., self._colours[self.columns]]
+        entries = jnp.moveaxis(entries, 1, -1)
+        shape = (num_rows, *[1] * (entries.ndim - 2), width)
+        return entries * jnp.asarray(self._filled, x.dtype).reshape(shape)
+
+
+def kept_factors(size: int, dtype: Any) -> AbstractFactors | None:
+    """What a solve hands to the next at first: an inverse, where it is small."""
+    return Inverse.empty(size, dtype) if size <= SMALL else None

@@ -1,0 +1,154 @@
+"""Regular matrices that fall apart into independent square blocks, wherever these stand.
+
+The map from rates of coordinates to velocities is one: each body has its own.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import jaxpr_as_fun
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PyTree
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+from ..._programs import Indices, is_known, jacobian_pattern
+from .dense import inverse
+
+
+class Parts(Indices):
+    """Which rows and columns of a matrix belong together.
+
+    - `groups`: for each size of blocks the rows and the columns of all of that size, two
+      arrays of shape `(blocks, size)`; first, of size zero, those that are just a one.
+    - `of_rows`, `of_columns`: where each is found in the groups, one behind the other.
+    """
+
+    def __init__(self, labels: np.ndarray, is_one: np.ndarray):
+        """Labels of rows and of columns, and whether the blocks so labelled are a one."""
+        super().__init__(np.concatenate([*labels, is_one]))
+        sizes = np.bincount(labels[0])
+        places = np.argsort(labels, axis=1, kind="stable")
+        starts, kinds = np.cumsum(sizes) - sizes, np.where(is_one, 0, sizes)
+        self.groups = []
+        for kind in np.unique(kinds):
+            entries = starts[kinds == kind][:, None] + np.arange(max(kind, 1))
+            self.groups.append((kind, *(x[entries] for x in places)))
+        sides = ([group[side].ravel() for group in self.groups] for side in (1, 2))
+        self.of_rows, self.of_columns = (np.argsort(np.concatenate(x)) for x in sides)
+
+
+def parts_of(constants: Float[np.ndarray, "n n"]) -> Parts | None:
+    """The blocks of a regular matrix, of which some entries are known and others NaN.
+
+    `None` where it is a single one.
+    """
+    size = len(constants)
+    rows, columns = np.nonzero(constants)
+    entries = np.ones(rows.size), (rows, size + columns)
+    graph = csr_array(entries, shape=(2 * size, 2 * size))
+    count, labels = connected_components(graph, directed=False)
+    labels = labels.reshape(2, size)
+    sizes, widths = (np.bincount(x, minlength=count) for x in labels)
+    # A matrix with blocks that are not square is singular: that is for others to find.
+    if count == 1 or np.any(sizes != widths):
+        return None
+    ones = np.zeros(count, bool)
+    ones[labels[0][rows[constants[rows, columns] == 1]]] = True
+    return Parts(labels, ones & (sizes == 1))
+
+
+def constant_entries(
+    fn: Callable[[PyTree[Array]], Array], inputs: PyTree
+) -> Float[np.ndarray, "..."] | None:
+    """The entries of a function that are the same for all `inputs`; NaN for the others.
+
+    `None` where that cannot be told. Of the traced program: the numbers are not looked at.
+    """
+    numbers, rest = eqx.partition(inputs, eqx.is_inexact_array)
+    if not is_known(rest):
+        return None
+    flat, unravel = ravel_pytree(jax.tree.map(jnp.ones_like, numbers))
+    program = jax.make_jaxpr(lambda x: fn(eqx.combine(unravel(x), rest)))(flat)
+    if not is_known(program.consts):
+        return None
+    values = lambda x: jaxpr_as_fun(program)(x)[0]
+    pattern = jacobian_pattern(values, flat, of_values=True)
+    if pattern is None:
+        return None
+    with jax.ensure_compile_time_eval():
+        # What depends on nothing has its value at any point.
+        somewhere = np.asarray(jax.jit(values)(np.ones(flat.shape, flat.dtype)))
+    depends = (np.diff(pattern.indptr) > 0).reshape(somewhere.shape)
+    return np.where(depends, np.nan, somewhere)
+
+
+def solve_parts(
+    parts: Parts | None, matrix: Float[Array, "n n"], right: Float[Array, " n"]
+) -> Float[Array, " n"]:
+    """`matrix^-1 right`, differentiable; not finite where the matrix is singular."""
+    if parts is None:
+        return inverse(matrix) @ right
+    pieces = []
+    for size, rows, columns in parts.groups:
+        part = _take(right, rows)
+        pieces.append(_solve(_blocks(matrix, rows, columns), part) if size else part)
+    return _joined(pieces, parts.of_columns)
+
+
+def multiply_parts(
+    parts: Parts, matrix: Float[Array, "n n"], x: Float[Array, " n"]
+) -> Float[Array, " n"]:
+    """`matrix @ x`: each row of what its block depends on, and on nothing else."""
+    pieces = []
+    for size, rows, columns in parts.groups:
+        part = _take(x, columns)
+        pieces.append(_times(_blocks(matrix, rows, columns), part) if size else part)
+    return _joined(pieces, parts.of_rows)
+
+
+# Blocks that are cut out one by one.
+_FEW = 8
+
+
+def _blocks(matrix: Array, rows: np.ndarray, columns: np.ndarray) -> Array:
+    if len(rows) > _FEW:
+        return matrix[rows[:, :, None], columns[:, None, :]]
+    cut = lambda r, c: _take(_take(matrix, r).T, c).T
+    return jnp.stack([cut(r, c) for r, c in zip(rows, columns, strict=True)])
+
+
+def _take(x: Array, indices: np.ndarray) -> Array:
+    """`x[indices]`, as a slice where it is one: XLA keeps that inside a loop."""
+    first, last = indices.flat[0], indices.flat[-1] + 1
+    if np.array_equal(indices.ravel(), np.arange(first, last)):
+        return x[first:last].reshape(*indices.shape, *x.shape[1:])
+    return x[indices]
+
+
+def _joined(pieces: list[Array], order: np.ndarray) -> Array:
+    return _take(jnp.concatenate([x.ravel() for x in pieces]), order)
+
+
+@jax.custom_jvp
+def _solve(
+    blocks: Float[Array, "blocks k k"], right: Float[Array, "blocks k"]
+) -> Float[Array, "blocks k"]:
+    return _times(_inverses(blocks), right)
+
+
+@_solve.defjvp
+def _solve_jvp(primals, tangents):
+    (blocks, right), (dblocks, dright) = primals, tangents
+    x = _solve(blocks, right)
+    return x, _times(_inverses(blocks), dright - _times(dblocks, x))
+
+
+def _times(blocks: Array, x: Array) -> Array:
+    return jnp.sum(blocks * x[:, None, :], axis=-1)
+
+
+_inverses = jax.vmap(inverse)

@@ -1,0 +1,152 @@
+"""The one nonlinear driver: every step equation of the package is solved here.
+
+It knows no mechanics. It takes a function whose arguments and values are scaled to
+order one, and finds its root, by default with `Newton`. Derivatives of the root follow
+from the implicit function theorem, in forward and in reverse mode.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PyTree
+
+from .._programs import in_one_function, is_known, LARGE
+from .._types import Flag, Scalar
+from .linear.dense import AbstractFactors
+from .linear.jacobian import kept_factors, Linearisable, linearisable
+from .newton import Newton, Start
+from .search import flat_of, flattened, Root, RootFinder, search
+
+
+# The name under which a policy of `jax.checkpoint` knows the value of a root.
+ROOT = "enerjax_root"
+
+
+@eqx.filter_custom_jvp
+def _root(fn, simplified, root_finder, args, start, max_iterations):
+    return search(fn, simplified, root_finder, args, start, max_iterations)
+
+
+@_root.def_jvp
+def _root_jvp(primals, tangents):
+    fn, simplified, root_finder, args, start, max_iterations = primals
+    t_args = tangents[3]
+    # Apart: derivatives neither trace nor need how it is found.
+    again = lambda: _root(fn, simplified, root_finder, args, start, max_iterations)
+    root = in_one_function(again)()
+    # All that the derivatives of a step need of the search for it.
+    root = eqx.tree_at(
+        lambda root: (root.value, root.found, root.broken, root.finite),
+        root,
+        replace_fn=lambda x: jax.tree.map(lambda x: checkpoint_name(x, ROOT), x),
+    )
+    is_none = lambda x: x is None
+    unmoved = jax.tree.map(is_none, t_args, is_leaf=is_none)
+    fixed, moved = eqx.partition(args, unmoved, is_leaf=is_none)
+    flat, unravel, flat_fn = flattened(fn, root.value)
+    by_args = lambda moved: flat_fn(flat, eqx.combine(moved, fixed))
+    _, rate = jax.jvp(by_args, (moved,), (t_args,))
+    given = root_finder.linear_solver if isinstance(root_finder, Newton) else None
+    fill = flat_of(args[-1])
+    linear = linearisable(flat_fn, flat, args, given, fill)
+    change = linear.solve(flat, -rate)
+    if fill is not None:
+        change = change + _turned(linear, flat_fn, flat, (moved, fixed), t_args)
+    # Nothing but the root itself depends on the arguments: not how it was found.
+    still = jax.tree.map(jnp.zeros_like, eqx.filter(root, eqx.is_inexact_array))
+    return root, eqx.tree_at(lambda root: root.value, still, unravel(change))
+
+
+def _turned(
+    linear: Linearisable,
+    fn: Callable[[Array, PyTree], Array],
+    root: Float[Array, " n"],
+    parts: tuple[PyTree, PyTree],
+    t_args: PyTree,
+) -> Float[Array, " n"]:
+    """How fast a root of least size moves into what the equations leave open.
+
+    That turns with the arguments, and the root stays orthogonal to it. It is the limit of
+    the roots `r` of `fn(r) + fill r = 0` for a fill that vanishes; their derivatives show
+    this part at `r`, one correction off, and not at the root.
+    """
+    moved, fixed = parts
+
+    def filled(moved: PyTree, at: Array) -> Array:
+        args = eqx.combine(moved, fixed)
+        return fn(at, args) + ravel_pytree(args[-1])[0] * at
+
+    assert linear.fill is not None
+    solve = linear.filled_solver(root)
+    regular = root - solve(linear.fill * root)
+    _, rate = jax.jvp(lambda moved: filled(moved, regular), (moved,), (t_args,))
+    return linear.open_part(solve, linear.filled_solver(regular)(-rate))
+
+
+def find_root(
+    fn: Callable[[PyTree[Array], Any], PyTree[Array]],
+    root_finder: RootFinder,
+    guess: PyTree[Array],
+    args: PyTree,
+    *,
+    max_iterations: int,
+    others: Sequence[PyTree[Array]] = (),
+    factors: AbstractFactors | None = None,
+    skip: Flag | bool = False,
+    fill: PyTree[Array] | None = None,
+    least: Scalar | float = 1.0,
+    simplified: Callable[[PyTree[Array], PyTree[Array], Any], PyTree[Array]] | None = None,
+) -> Root:
+    """The root of `fn(y, args)`. Never raises.
+
+    The implicit function theorem gives its derivatives with respect to `args`, with one
+    linear solve each; a singular lane of a batch has non-finite derivatives of its own and
+    leaves the others alone. `guess`, `factors` (of a solve before) and `others`,
+    guesses that
+    `Newton` turns to where it fails, only say where to begin. With `skip`, `Newton`
+    returns the guess without an iteration.
+
+    `fill` is for equations that do not determine some of the unknowns, and do not ask for
+    them either: small numbers that are added to the diagonal of the Jacobian, and make it
+    regular. Of all roots it is then the one of least size that is found, in the norm that
+    `fill` weights, with its derivatives. Unknowns that turn out all smaller than one are
+    resolved by their own size, down to `least`.
+
+    `simplified(y, held, args)` equals `fn` where `held` is `y`. Where its Jacobian in `y`
+    is a narrower band, `Newton` searches with that, and with the exact one only where that
+    search has failed.
+    """
+    flat, _ = ravel_pytree(guess)
+    start = Start(
+        guess,
+        tuple(others),
+        kept_factors(flat.size, flat.dtype) if factors is None else factors,
+        jnp.asarray(skip),
+        fill,
+        jnp.asarray(least, flat.dtype),
+    )
+    start = jax.lax.stop_gradient(start)
+    traced, opened = _opened(fn, guess, args)
+    call = lambda y, inputs: opened(inputs[0], y, inputs[1])
+    near, traced_too = None, None
+    if simplified is not None and flat.size > LARGE:
+        traced_too, opened_too = _opened(simplified, guess, guess, args)
+        near = lambda y, held, inputs: opened_too(inputs[2], y, held, inputs[1])
+    inputs = traced, args, traced_too, fill
+    return _root(call, near, root_finder, inputs, start, max_iterations)
+
+
+def _opened(fn: Callable, *like: Any) -> tuple[Any, Callable]:
+    """What is traced of that which `fn` closes over, and `fn` as a function of it too."""
+    # Functions in `args` may hold traced numbers. (The lambda has a closure, without which
+    # the conversion would not look for any.)
+    closed = lambda *args: fn(*args)
+    converted = eqx.filter_closure_convert(closed, *like)
+    # What is known stays closed over: indices tell which unknowns a row depends on.
+    traced, known = eqx.partition(converted, lambda x: not is_known(x))
+    return traced, lambda traced, *args: eqx.combine(traced, known)(*args)

@@ -1,0 +1,147 @@
+"""The search for a root: by Newton's method, or by a root finder of optimistix."""
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PyTree
+
+from .._types import Count, Flag, Scalar
+from .linear.dense import AbstractFactors, Inverse
+from .linear.jacobian import Linearisable, linearisable, narrowed
+from .newton import Newton, Start
+from .newton_iterations import max_norm, newton_iterations, PATIENCE
+
+
+RootFinder: TypeAlias = Newton | optx.AbstractRootFinder | optx.AbstractLeastSquaresSolver
+
+
+class Root(eqx.Module):
+    """A root, or the last iterate where none was found.
+
+    - `value`: the unknowns.
+    - `factors`: for the next solve.
+    - `iterations`: corrections made.
+    - `residual`: its largest entry; of `Newton` before the last correction.
+    - `found`: whether they converged.
+    - `broken`: whether they became singular or non-finite.
+    - `finite`: whether the residual is.
+    """
+
+    value: PyTree[Array]
+    factors: AbstractFactors | None
+    iterations: Count
+    residual: Scalar
+    found: Flag
+    broken: Flag
+    finite: Flag
+
+
+def flattened(fn: Callable, value: PyTree[Array]) -> tuple[Array, Callable, Callable]:
+    """A value as a vector, its inverse, and `fn` between vectors."""
+    flat, unravel = ravel_pytree(value)
+    return flat, unravel, lambda x, args: ravel_pytree(fn(unravel(x), args))[0]
+
+
+def flat_of(fill: PyTree[Array] | None) -> Array | None:
+    return None if fill is None else ravel_pytree(fill)[0]
+
+
+def search(
+    fn: Callable[[PyTree[Array], Any], PyTree[Array]],
+    simplified: Callable[[PyTree[Array], PyTree[Array], Any], PyTree[Array]] | None,
+    root_finder: RootFinder,
+    args: PyTree,
+    start: Start,
+    max_iterations: int,
+) -> Root:
+    if not isinstance(root_finder, Newton):
+        solution = optx.root_find(
+            fn, root_finder, start.guess, args, max_steps=max_iterations, throw=False
+        )
+        found, singular, nonfinite = (
+            solution.result == getattr(optx.RESULTS, name)
+            for name in ("successful", "singular", "nonfinite")
+        )
+        steps = solution.stats["num_steps"]
+        residual = max_norm(fn(solution.value, args))
+        # Tolerances finer than the unknowns can be resolved end at `max_iterations`.
+        found = found | (residual <= Newton().atol * jnp.finfo(residual.dtype).eps)
+        return Root(
+            solution.value,
+            start.factors,
+            steps,
+            residual,
+            found,
+            singular | nonfinite,
+            jnp.isfinite(residual),
+        )
+    flat, unravel, flat_fn = flattened(fn, start.guess)
+    given, fill = root_finder.linear_solver, flat_of(start.fill)
+    exact, near = linearisable(flat_fn, flat, args, given, fill), None
+    if simplified is not None and given is None:
+        flat_simplified = lambda x, inputs: ravel_pytree(
+            simplified(unravel(x), unravel(inputs[0]), inputs[1])
+        )[0]
+        near = narrowed(exact, flat_simplified, flat, args)
+    if near is None:
+        return _iterated(exact, root_finder, start, max_iterations)
+    alone = eqx.tree_at(lambda start: start.others, start, ())
+    first = _iterated(near, root_finder, alone, PATIENCE)
+
+    def again() -> Root:
+        # (The lanes of a batch all come here.)
+        left = eqx.tree_at(lambda start: start.skip, start, start.skip | first.found)
+        last = _iterated(exact, root_finder, left, max_iterations)
+        made = first.iterations + last.iterations
+        return eqx.tree_at(lambda root: root.iterations, last, made)
+
+    return jax.lax.cond(first.found, lambda: first, again)
+
+
+def _iterated(
+    residual: Linearisable, newton: Newton, start: Start, max_jacobians: int
+) -> Root:
+    _, unravel = ravel_pytree(start.guess)
+    last = newton_iterations(residual, newton, start, max_jacobians)
+    x = last.x
+    if residual.fill is not None:
+        x = jnp.where(last.done & ~start.skip, _least(residual, last.factors, x), x)
+    keeps = residual.keeps_factors and start.factors is not None
+    factors = last.factors if keeps else start.factors
+    return Root(
+        unravel(x),
+        factors,
+        last.corrections,
+        last.defect,
+        last.done,
+        last.broken,
+        jnp.isfinite(last.defect),
+    )
+
+
+def _least(
+    residual: Linearisable, factors: AbstractFactors, x: Float[Array, " n"]
+) -> Float[Array, " n"]:
+    """The root of least size, from one with a part that the equations leave open.
+
+    By the Jacobian at the root: what another one is off by is divided by the fill.
+    """
+    matrix = residual.jacobian(x)
+    once = factors.renewed(matrix).solve
+
+    def solve(right: Array) -> Array:
+        first = once(right)
+        if not isinstance(factors, Inverse):
+            return first
+        # The inverse of what is nearly singular loses digits, which a correction finds.
+        return first + once(right - matrix @ first)
+
+    closed = x - residual.open_part(solve, x)
+    # Equations that are not linear in these unknowns may tell them apart, by little.
+    change = solve(residual.value(closed))
+    return closed - change + residual.open_part(solve, change)

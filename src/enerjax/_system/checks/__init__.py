@@ -1,0 +1,1 @@
+"""Whether a system makes sense, told before any step."""

@@ -1,0 +1,195 @@
+"""Whether the functions of a system fit its state, before anything is evaluated."""
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ..._types import Args
+from ..base import AbstractSystem, State
+from ..canonical import HamiltonianSystem, LagrangianSystem
+from ..kinematics import ConfigurationKinematics
+from ..separable import System
+
+
+_SIGNATURES = dict(
+    potential="`(q, args)`",
+    kinetic="`(v, args)`, or `(q, qdot, args)` of `System.from_lagrangian`,",
+    hamiltonian="`(q, p, args)`",
+    constraint="`(q, args)`",
+    coordinate_constraint="`(q, args)`",
+    force="`(q, v, t, args)`",
+    driven="`(q, t, args)`",
+    symmetry="`(q, args)`",
+    kinematics="`(q, args)`",
+)
+
+
+def describe(role: str, fn: Any) -> str:
+    name = getattr(fn, "__name__", None)
+    return f"`{role}`" if name in (None, role, "<lambda>") else f"`{role}` (`{name}`)"
+
+
+def _shape(role: str, fn: Callable, *inputs: Any) -> tuple[int, ...]:
+    """Of the value of a function of the system, which must be a real array."""
+    try:
+        inspect.signature(fn).bind(*inputs)
+    except TypeError as error:
+        raise TypeError(
+            f"{describe(role, fn)} must take {len(inputs)} arguments, {_SIGNATURES[role]} "
+            f"here: {error}."
+        ) from None
+    except ValueError:  # no signature to be had
+        pass
+    out = _traced(role, fn, *inputs)
+    if not hasattr(out, "shape") or not jnp.issubdtype(out.dtype, jnp.floating):
+        kind = out.dtype if hasattr(out, "dtype") else f"a Python {type(out).__name__}"
+        raise TypeError(
+            f"{describe(role, fn)} must return a real JAX array, got {kind}. Write it "
+            "with `jax.numpy` from its arguments: `0.0 * q[0]` is a zero of the right kind."
+            + (" Is its `return` missing?" if out is None else "")
+        )
+    return out.shape
+
+
+def _traced(role: str, fn: Callable, *inputs: Any) -> Any:
+    """The kind of value that a function returns, and in its name what it raises."""
+    try:
+        return eqx.filter_eval_shape(fn, *inputs)
+    except (
+        jax.errors.ConcretizationTypeError,
+        jax.errors.TracerArrayConversionError,
+        jax.errors.TracerIntegerConversionError,
+    ) as error:
+        raise TypeError(
+            f"{describe(role, fn)} asks for the value of a number that is traced. Write it "
+            "with `jax.numpy`, not `math` or `numpy`, and `jnp.where` instead of `if`."
+        ) from error
+    except Exception as error:
+        raise ValueError(
+            f"{describe(role, fn)} raised {type(error).__name__}: "
+            f"{str(error).removesuffix('.')}. It is called "
+            f"with {_SIGNATURES[role]}, and `args` is {_kind(inputs[-1])} here."
+        ) from error
+
+
+def _kind(args: Any) -> str:
+    if isinstance(args, dict):
+        return f"a dictionary with the keys {sorted(map(str, args))}"
+    return "None" if args is None else f"of type {type(args).__name__}"
+
+
+def check_shapes(system: AbstractSystem, state: State, args: Args) -> None:
+    for role, fn, inputs in energies(system, state, args):
+        shape = _shape(role, fn, *inputs)
+        if shape != ():
+            raise ValueError(
+                f"{describe(role, fn)} must return a scalar, an energy, got shape {shape}."
+                + (" Sum over the bodies, or index the entry." if shape else "")
+            )
+    rows = _rows("constraint", system.constraint, state.q, args)
+    rows += _rows("driven", system.driven, state.q, state.t, args)
+    if rows > state.q.size and not system.redundant:
+        raise ValueError(
+            f"{rows} constraints of {state.q.size} coordinates cannot be independent. "
+            "Leave out those that follow from the others, or declare "
+            "`System(..., redundant=True)`."
+        )
+    _check_force(system, state, args)
+    _check_symmetry(system, state, args)
+    if isinstance(system, System):
+        _check_separable(system, state, args)
+    elif state.q.size != state.v.size:
+        name = "momenta" if isinstance(system, HamiltonianSystem) else "velocities"
+        raise ValueError(
+            f"`q` has {state.q.size} entries and `v`, the {name}, has {state.v.size}: "
+            "give as many of each."
+        )
+
+
+def energies(
+    system: AbstractSystem, state: State, args: Args
+) -> list[tuple[str, Callable, tuple]]:
+    """The user's energy functions, their names, and what they are called with."""
+    q, v = state.q, state.v
+    if isinstance(system, HamiltonianSystem):
+        return [("hamiltonian", system.hamiltonian, (q, v, args))]
+    if isinstance(system, LagrangianSystem):
+        kinetic = ("kinetic", system.kinetic, (q, v, args))
+        return [("potential", system.potential, (q, args)), kinetic]
+    assert isinstance(system, System)
+    potential = ("potential", system.potential, (q, args))
+    if not callable(system.kinetic):
+        return [potential]
+    return [potential, ("kinetic", system.kinetic, (v, args))]
+
+
+def _check_force(system: AbstractSystem, state: State, args: Args) -> None:
+    if system.force is None:
+        return
+    shape = _shape("force", system.force, state.q, state.v, state.t, args)
+    if shape != state.v.shape:
+        raise ValueError(
+            f"{describe('force', system.force)} returned shape {shape}, but `v` has "
+            f"{state.v.size} entries: give one for each, conjugate to it (its power is "
+            "`force . v`). A force on a point enters with the Jacobian of the point."
+        )
+
+
+def _check_symmetry(system: AbstractSystem, state: State, args: Args) -> None:
+    if system.symmetry is None:
+        return
+    shape = _shape("symmetry", system.symmetry, state.q, args)
+    if len(shape) != 2 or shape[1] != state.v.size:
+        raise ValueError(
+            f"{describe('symmetry', system.symmetry)} returned shape {shape}: give one row "
+            f"of {state.v.size} velocities for each symmetry. A single one is "
+            "`velocities[None]`."
+        )
+
+
+def _rows(role: str, fn: Callable | None, *inputs: Any) -> int:
+    """The number of rows of a constraint."""
+    if fn is None:
+        return 0
+    shape = _shape(role, fn, *inputs)
+    if len(shape) != 1:
+        raise ValueError(
+            f"{describe(role, fn)} must return a vector, got shape {shape}. "
+            "Wrap a single constraint as `jnp.array([value])`."
+        )
+    return shape[0]
+
+
+def _check_separable(system: System, state: State, args: Args) -> None:
+    nq, nv = state.q.size, state.v.size
+    if not callable(system.kinetic) and system.kinetic.shape != (nv, nv):
+        raise ValueError(
+            f"The inertia matrix has shape {system.kinetic.shape}, but `v` has {nv} "
+            f"entries: give a ({nv}, {nv}) matrix."
+        )
+    redundant = _rows("coordinate_constraint", system.coordinate_constraint, state.q, args)
+    if not isinstance(system.kinematics, ConfigurationKinematics):
+        if nq != nv:
+            raise ValueError(
+                f"`q` has {nq} entries and `v` has {nv}. Without `kinematics` the "
+                "velocities are the rates of the coordinates: give as many of each, or "
+                "`System(..., kinematics=L)` with `v = L(q, args) qdot`."
+            )
+        return
+    fn = system.kinematics.matrix
+    shape = _shape("kinematics", fn, state.q, args)
+    if shape != (nv, nq):
+        raise ValueError(
+            f"{describe('kinematics', fn)} returned shape {shape}; `v = L qdot` with "
+            f"{nv} velocities and {nq} coordinates needs ({nv}, {nq})."
+        )
+    if redundant != nq - nv:
+        raise ValueError(
+            f"{nq} coordinates with {nv} velocities are redundant {nq - nv} times, but "
+            f"`coordinate_constraint` has {redundant} rows. Give "
+            "one row for each redundancy, such as `p @ p - 1` for a unit quaternion."
+        )

@@ -1,0 +1,146 @@
+"""Whether the numbers of a system make sense: finite energies, a regular inertia."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..._programs import is_known
+from ..._solvers import blocks_of, Symmetric
+from ..._types import Args
+from ..base import AbstractSystem, State
+from ..canonical import HamiltonianSystem, LagrangianSystem
+from ..separable import System
+from .shapes import describe, energies
+
+
+def direction_without_symmetry(x: Float[Array, " n"]) -> Float[Array, " n"]:
+    """A direction in which what depends on `x` is unlikely to stay as it is."""
+    return 1 + 0.5 * jnp.cos(jnp.arange(x.size, dtype=x.dtype))
+
+
+@eqx.filter_jit
+def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]:
+    inertia = system.inertia(state, args)
+    blocks, eps = blocks_of(inertia), 1e3 * jnp.finfo(inertia.dtype).eps
+    masses = jnp.diagonal(blocks, axis1=1, axis2=2)
+    root = jnp.sqrt(jnp.where(masses > 0, masses, 1))
+    scaled = blocks / (root[:, :, None] * root[:, None, :])
+    finite = lambda tree: jnp.all(
+        jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(tree)], bool)
+    )
+    constraints = [system.constraint]
+    if isinstance(system, System):
+        constraints.append(system.coordinate_constraint)
+    potential = lambda q: system.potential_energy(State(q, jnp.zeros_like(state.v)), args)
+    held = [lambda q, fn=fn: fn(q, args) for fn in constraints if fn is not None]
+    # A row that depends on `q` changes along this direction.
+    along = direction_without_symmetry(state.q)
+    rates = [jax.jvp(fn, (state.q,), (along,))[1] for fn in held]
+    slopes = jnp.concatenate([jnp.zeros((0,), state.q.dtype), *rates])
+    timed, t = [], state.t
+    if system.force is not None and t is not None:
+        timed.append(system.force(state.q, state.v, t, args))
+    if system.driven is not None and t is not None:
+        timed.append(system.driven(state.q, t, args))
+    return dict(
+        start=finite(state),
+        args=finite([x for x in jax.tree.leaves(args) if eqx.is_inexact_array(x)]),
+        potential=finite(system.potential_energy(state, args)),
+        timed=finite(timed),
+        constraint=finite([f(state.q, args) for f in constraints if f is not None]),
+        slope=finite(jax.grad(potential)(state.q)),
+        slopes=finite(slopes),
+        depends=jnp.array(system.redundant) | jnp.all(slopes != 0),
+        inertia=finite(inertia),
+        quadratic=_is_quadratic(system, state, inertia, args),
+        symmetric=jnp.all(jnp.abs(scaled - jnp.swapaxes(scaled, 1, 2)) <= eps),
+        definite=jnp.all(masses > 0) & finite(jnp.linalg.cholesky(scaled)),
+    )
+
+
+def _is_quadratic(
+    system: AbstractSystem, state: State, inertia: Symmetric, args: Args
+) -> Array:
+    """Whether the kinetic energy is `1/2 v . inertia v`; a Hamiltonian need not be."""
+    if isinstance(system, HamiltonianSystem):
+        return jnp.array(True)
+    v = state.v
+    energy = lambda v: system.kinetic_energy(State(state.q, v), args)
+    # A probe with no symmetry, of the size of the velocities.
+    probe = (1 + jnp.max(jnp.abs(v))) * jnp.cos(jnp.arange(1, v.size + 1, dtype=v.dtype))
+    quadratic = 0.5 * probe @ inertia @ probe
+    error = jnp.abs(energy(probe) - quadratic) + jnp.abs(energy(-probe) - quadratic)
+    size = jnp.abs(probe) @ jax.tree.map(jnp.abs, inertia) @ jnp.abs(probe)
+    return error <= 1e3 * jnp.finfo(v.dtype).eps * size
+
+
+def check_values(system: AbstractSystem, state: State, args: Args) -> None:
+    facts = _facts(system, state, args)
+    if not is_known(facts):  # the functions of the system close over traced numbers
+        return
+    functions = {role: describe(role, fn) for role, fn, _ in energies(system, state, args)}
+    kinetic = functions.get("kinetic", functions.get("hamiltonian"))
+    potential = functions.get("potential", kinetic)
+    inertia, missing = "inertia matrix", "A coordinate without mass, or a negative mass?"
+    if isinstance(system, HamiltonianSystem):
+        inertia = f"inverse Hessian of {kinetic} in the momenta"
+        missing = "Is a momentum without energy, or at a singular configuration?"
+    elif kinetic is not None:
+        inertia = f"inertia (the Hessian of {kinetic})"
+    if isinstance(system, LagrangianSystem):
+        missing += " Or are the coordinates singular at the start (polar ones at r = 0)?"
+    elsewhere = " Inertia that varies: `System.from_lagrangian`."
+    if not isinstance(system, System):
+        elsewhere = ""
+    for name, message in (
+        ("start", f"The start is not finite: q = {state.q}, v = {state.v}."),
+        ("args", f"`args` holds a number that is not finite: {args}."),
+        (
+            "potential",
+            f"{potential} is not finite at the start, q = {state.q}. Is it defined there?",
+        ),
+        (
+            "timed",
+            f"`force` or `driven` is not finite at the start, t = {state.t}. Is it defined "
+            "there?",
+        ),
+        (
+            "slope",
+            f"The slope of {potential} is not finite at the start, q = {state.q}. It must "
+            "be differentiable there: the norm of a vector that vanishes is not, nor the "
+            "root of zero.",
+        ),
+        ("constraint", "The constraints are not finite at the start. Defined there?"),
+        (
+            "slopes",
+            f"The slope of a constraint is not finite at the start, q = {state.q}. Write "
+            "lengths as squares: `d @ d - l**2`.",
+        ),
+        (
+            "depends",
+            "A row of the constraints does not depend on `q` at the start: is it constant, "
+            "or the square of what vanishes?",
+        ),
+        (
+            "inertia",
+            f"The {inertia} is not finite. {missing}"
+            if isinstance(system, HamiltonianSystem)
+            else f"The {inertia} is not finite. A kinetic energy must have second "
+            "derivatives at `v = 0`: write `v @ v`, not the square of a norm.",
+        ),
+        (
+            "quadratic",
+            f"{kinetic} is not quadratic in the velocities: it must be `1/2 v . M v`, with "
+            f"no linear or constant part.{elsewhere} Other energies: "
+            "`System.from_hamiltonian`.",
+        ),
+        ("symmetric", f"The {inertia} is not symmetric."),
+        (
+            "definite",
+            f"The {inertia} is not positive definite. {missing} Every velocity needs some "
+            "inertia.",
+        ),
+    ):
+        if not facts[name]:
+            raise ValueError(message)

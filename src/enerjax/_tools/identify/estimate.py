@@ -1,0 +1,127 @@
+"""What a fit finds, and how well it is known."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import scipy.stats
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PyTree
+
+from ..._types import Count, Scalar
+
+
+CONFIDENCE = 0.95
+
+
+class Fit(eqx.Module):
+    """Estimated parameters, and how well the data tells them.
+
+    - `parameters`: the estimate, a pytree like the guess.
+    - `standard_errors`: of each parameter, the same pytree; infinite where the data says
+      nothing, alone or together with others.
+    - `lower`, `upper`: the ends of its 95 % confidence interval (Student's t), from the
+      linearisation at the estimate; of positive parameters in their logarithm.
+    - `covariance`: of all parameters in the order of `names`, shape `(n, n)`.
+    - `cost`: the sum of the squares of the residuals.
+    - `degrees_of_freedom`: residuals less parameters.
+    - `iterations`: of the solver, steps that were rejected included.
+    - `simulations`: evaluations of the residuals, of their derivative by one parameter, and
+      (by minimisers) of a gradient; those at the end for the covariance included.
+    - `result`: `optimistix.RESULTS.successful`, or why the solver stopped.
+    - `names`: of the parameters, from their place in the pytree.
+
+    `print` shows a table.
+    """
+
+    parameters: PyTree[Any]
+    standard_errors: PyTree[Any]
+    lower: PyTree[Any]
+    upper: PyTree[Any]
+    covariance: Float[Array, "n n"]
+    cost: Scalar
+    iterations: Count
+    simulations: Count
+    result: optx.RESULTS
+    degrees_of_freedom: int = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def noise(self) -> Scalar:
+        """The standard deviation of the residuals."""
+        return jnp.sqrt(self.cost / self.degrees_of_freedom)
+
+    def __str__(self) -> str:
+        columns = (self.parameters, self.standard_errors, self.lower, self.upper)
+        numbers = np.stack([np.asarray(ravel_pytree(x)[0]) for x in columns], axis=1)
+        width = max(map(len, (*self.names, "parameter")))
+        lines = [f"{'parameter':{width}s}  {'estimate':>12s}  {'error':>8s}  95 % interval"]
+        for name, (value, error, low, high) in zip(self.names, numbers, strict=True):
+            lines.append(
+                f"{name:{width}s}  {value:12.6g}  {error:8.2g}  {low:.6g} to {high:.6g}"
+            )
+        lines.append(
+            f"noise {float(self.noise):.3g}, {self.degrees_of_freedom} degrees of freedom, "
+            f"{int(self.iterations)} iterations"
+        )
+        return "\n".join(lines)
+
+
+class Unknowns(eqx.Module):
+    """Parameters as one vector, the logarithms of those that are positive."""
+
+    positive: Array
+    unravel: Any = eqx.field(static=True)
+
+    def parameters(self, x: Float[Array, " n"]) -> PyTree[Any]:
+        return self.unravel(self.numbers(x))
+
+    def numbers(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        # Of others no exponential is taken: it may overflow, with a derivative of NaN.
+        return jnp.where(self.positive, jnp.exp(jnp.where(self.positive, x, 0)), x)
+
+    def vector(self, numbers: Float[Array, " n"]) -> Float[Array, " n"]:
+        return jnp.where(
+            self.positive, jnp.log(jnp.where(self.positive, numbers, 1)), numbers
+        )
+
+    def slopes(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Of the numbers by the unknowns."""
+        return jnp.where(self.positive, self.numbers(x), 1)
+
+
+def covariance(
+    jacobian: Float[Array, "m n"], variance: Scalar
+) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+    """`variance (J^T J)^-1`, and which parameters the rows of `J` do not determine."""
+    size = jnp.linalg.norm(jacobian, axis=0)
+    scale = jnp.where(size > 0, size, 1)
+    _, values, directions = jnp.linalg.svd(jacobian / scale[None], full_matrices=False)
+    eps = jnp.finfo(jacobian.dtype).eps
+    # Derivatives of a run have about this accuracy, whatever their size.
+    silent = values <= jnp.sqrt(eps) * values[0]
+    unseen = jnp.sum(jnp.where(silent[:, None], directions**2, 0), axis=0)
+    weak = (unseen > jnp.sqrt(eps)) | (size == 0)
+    inverse = jnp.where(silent, 0, 1 / jnp.where(silent, 1, values))
+    root = directions.T * inverse[None] / scale[:, None]
+    return variance * root @ root.T, weak
+
+
+def student(degrees_of_freedom: int) -> float:
+    """Half the width of the confidence interval, in standard errors."""
+    return float(scipy.stats.t.ppf(0.5 + CONFIDENCE / 2, degrees_of_freedom))
+
+
+def names_of(parameters: PyTree[Any]) -> tuple[str, ...]:
+    """A name for each number in a pytree."""
+    names = []
+    for path, leaf in jax.tree_util.tree_flatten_with_path(parameters)[0]:
+        name = jax.tree_util.keystr(path, simple=True, separator=".") or "parameter"
+        places = np.ndindex(np.shape(leaf))
+        names += [f"{name}{list(k)}" if k else name for k in places]
+    assert len(names) == sum(math.prod(np.shape(x)) for x in jax.tree.leaves(parameters))
+    return tuple(names)

@@ -1,0 +1,176 @@
+"""Results that are found by the values of their parameters."""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import numpy as np
+
+from ..._results import meanings, RESULTS, tally
+
+
+_Outcome = type(RESULTS.successful)
+
+
+@dataclasses.dataclass(frozen=True)
+class Sweep:
+    """What a sweep found.
+
+    - `axes`: the names of the parameters along each of the leading axes of the results;
+      those that changed together share one.
+    - `parameters`: their values, along their axis; of a parameter that was chosen with
+      `at` its value.
+    - `values`: what the function returned, with the axes of the parameters in front.
+
+    `print` shows what there is, and how many lanes failed.
+    """
+
+    axes: tuple[tuple[str, ...], ...]
+    parameters: dict[str, Any]
+    values: Any
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The number of values along each axis of the parameters."""
+        return tuple(
+            len(jax.tree.leaves(self.parameters[names[0]])[0]) for names in self.axes
+        )
+
+    @property
+    def failed(self) -> np.ndarray:
+        """Which lanes returned a failure (as `Solution.result`), an array of `shape`."""
+        failed = np.zeros(self.shape, bool)
+        for _, leaf in self._named():
+            if isinstance(leaf, _Outcome):
+                failed |= meanings(leaf) != "successful"
+        return failed
+
+    def at(self, **chosen: Any) -> "Sweep":
+        """The part at some values of parameters, such as `swept.at(alpha=0.5, h=1e-3)`.
+
+        Of parameters that changed together give as many as tell one point from the others.
+
+        **Raises:** `ValueError` for a value that is not there, and for several points.
+        """
+        unknown = set(chosen) - {name for names in self.axes for name in names}
+        if unknown:
+            left = ", ".join(name for names in self.axes for name in names) or "none"
+            raise ValueError(
+                f"`{min(unknown)}` is no parameter to choose; those left are: {left}."
+            )
+        part = self
+        for axis, names in reversed(list(enumerate(self.axes))):
+            given = {name: chosen[name] for name in names if name in chosen}
+            if given:
+                part = part._taken(axis, self._find(names, given))
+        return part
+
+    def smallest(self, name: str) -> "Sweep":
+        """The one lane where a result, a number named as `print` does, is smallest.
+
+        Its `parameters` are those to start a search from. NaN is passed over.
+
+        **Raises:** `ValueError` if there is no such result, or only NaN.
+        """
+        known = dict(self._named())
+        if name not in known or np.shape(known[name]) != self.shape:
+            numbers = [key for key, x in known.items() if np.shape(x) == self.shape]
+            raise ValueError(
+                f"`{name}` is no result of one number a lane; there are: "
+                f"{', '.join(numbers) or 'none'}."
+            )
+        if np.isnan(known[name]).all():
+            raise ValueError(f"`{name}` is NaN in all lanes: all have failed.")
+        place = np.unravel_index(np.nanargmin(known[name]), self.shape)
+        part = self
+        for axis in reversed(range(len(self.axes))):
+            part = part._taken(axis, int(place[axis]))
+        return part
+
+    def to_xarray(self) -> Any:
+        """An `xarray.Dataset`: results with named axes, the parameters as coordinates.
+
+        Outcomes become their messages. Axes of the results themselves are named after
+        them, `energy_0`, `energy_1`; parameters that are pytrees have no coordinate.
+
+        **Raises:** `ImportError` without xarray (the extra `sweep`).
+        """
+        try:
+            import xarray  # pyright: ignore[reportMissingImports]
+        except ImportError as error:
+            raise ImportError(
+                "`to_xarray` needs xarray, which is part of the extra `sweep`: "
+                'python -m pip install "enerjax[sweep]"'
+            ) from error
+        dims = tuple("_".join(names) for names in self.axes)
+        along = {
+            name: dim for dim, names in zip(dims, self.axes, strict=True) for name in names
+        }
+        variables = {}
+        for name, leaf in self._named():
+            array = meanings(leaf) if isinstance(leaf, _Outcome) else np.asarray(leaf)
+            own = [f"{name}_{k}" for k in range(array.ndim - len(dims))]
+            variables[name] = ((*dims, *own), array)
+        coordinates = {}
+        for name, array in self.parameters.items():
+            if isinstance(array, np.ndarray | np.generic):
+                front = (along[name],) if name in along else ()
+                own = [f"{name}_{k}" for k in range(array.ndim - len(front))]
+                coordinates[name] = ((*front, *own), array)
+        return xarray.Dataset(variables, coordinates)
+
+    def __str__(self) -> str:
+        counts = [
+            f"{', '.join(names)} ({count})"
+            for names, count in zip(self.axes, self.shape, strict=True)
+        ]
+        lines = [f"{int(np.prod(self.shape))} lanes: {' x '.join(counts) or 'one point'}"]
+        for name, leaf in self._named():
+            if isinstance(leaf, _Outcome):
+                lines.append(f"  {name}: {tally(leaf)}")
+            else:
+                lines.append(f"  {name}: {leaf.dtype}{list(leaf.shape[len(self.axes) :])}")
+        return "\n".join(lines)
+
+    def _named(self) -> Iterator[tuple[str, Any]]:
+        """The results and what they are called: outcomes, and arrays."""
+        flat, _ = jax.tree_util.tree_flatten_with_path(
+            self.values, is_leaf=lambda x: isinstance(x, _Outcome)
+        )
+        for path, leaf in flat:
+            yield jax.tree_util.keystr(path, simple=True, separator=".") or "value", leaf
+
+    def _find(self, names: tuple[str, ...], given: dict[str, Any]) -> int:
+        """The number of the point at which parameters have some values."""
+        match = np.array(True)
+        for name, value in given.items():
+            array = self.parameters[name]
+            if not isinstance(array, np.ndarray) or array.ndim != 1:
+                raise ValueError(
+                    f"The values of `{name}` are no numbers to choose by: index "
+                    "`values` along its axis."
+                )
+            # Decimal fractions are often rounded twice on their way here.
+            here = np.isclose(array, value, rtol=1e-6, atol=0, equal_nan=True)
+            if not here.any():
+                raise ValueError(f"`{name}` = {value} was not swept; its values: {array}.")
+            match = match & here
+        found = np.flatnonzero(match)
+        if found.size != 1:
+            told = ", ".join(f"{name} = {value}" for name, value in given.items())
+            raise ValueError(
+                f"{told}: {found.size} points of ({', '.join(names)}) are there, not one."
+            )
+        return int(found[0])
+
+    def _taken(self, axis: int, index: int) -> "Sweep":
+        names = self.axes[axis]
+        chosen = {
+            name: jax.tree.map(lambda x: x[index], self.parameters[name]) for name in names
+        }
+        return Sweep(
+            self.axes[:axis] + self.axes[axis + 1 :],
+            self.parameters | chosen,
+            jax.tree.map(lambda x: np.take(x, index, axis), self.values),
+        )

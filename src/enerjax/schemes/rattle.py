@@ -1,0 +1,111 @@
+import equinox as eqx
+
+from .._operators import AbstractModel, Increment
+from .._results import RESULTS
+from .._system import State
+from .._types import Coordinates, Multipliers, Scalar, Velocities
+from ._baseline import (
+    balance_rows,
+    measured_account,
+    model_of,
+    plain_problem,
+    reaction_force,
+)
+from .base import AbstractSingleSolve, Formulation, StepEnd, StepProblem
+
+
+class Rattle(AbstractSingleSolve[Increment, StepProblem]):
+    """RATTLE: the leapfrog (Stormer-Verlet) scheme on the constraints; for comparison.
+
+    With `V` for velocities half-way and `F = -dV/dq + f`,
+
+        M V  = M v0 + h/2 (F(q0, V) - B0^T lambda0),    q1 = q0 + h V,    Phi(q1) = 0
+        M v1 = M V  + h/2 (F(q1, V) - B1^T lambda1),                      B1 v1 = 0
+
+    - Conserves: the symplectic form, and linear and angular momentum. The energy
+      oscillates with `h^2` and does not drift, at steps short enough for the fastest
+      motion: the forces are explicit, so `h` times a frequency must stay below 2.
+    - Dissipates: nothing. It has no energy identity: `dissipated` is the measured loss
+      `E0 + work + drive_work - E1` of the step, of either sign.
+    - Constraints held at: position and velocity level.
+    - Order: 2. Symmetric: `Composed` raises the order to 4, 6 or 8.
+    - Multipliers: `(lambda0 + lambda1)/2`, the mean over the step.
+    - For a `System` without `kinematics`; `force` may depend on the velocity, and enters
+      at both ends with `V`. Others raise a `ValueError`.
+
+    **Reference:** H. C. Andersen, J. Comput. Phys. 52 (1983) 24-34; the form with general
+    constraints and its symplecticity: B. Leimkuhler and R. D. Skeel, J. Comput. Phys. 112
+    (1994) 117-125; E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration,
+    section VII.1.4.
+    """
+
+    @property
+    def order(self) -> int:
+        return 2
+
+    @property
+    def formulation(self) -> Formulation:
+        return "ggl"
+
+    @property
+    def symmetric(self) -> bool:
+        return True
+
+    def problem(self, model: AbstractModel, start: State, h: Scalar) -> StepProblem:
+        return plain_problem("Rattle", model, start, h, "ggl")
+
+    def predict(
+        self, problem: StepProblem, acceleration: Velocities, multipliers: Multipliers
+    ) -> Increment:
+        """The velocity half-way, `h lambda0` and, as velocity impulse, `h lambda1`."""
+        guess = problem.guess(acceleration, multipliers)
+        return eqx.tree_at(lambda z: z.velocity_impulse, guess, guess.impulse)
+
+    def residual(self, z: Increment, problem: StepProblem) -> Increment:
+        start, middle = problem.start, z.rate
+        pulled = self._pulled(problem, start.q, middle, start.t, z.impulse)
+        balance = model_of(problem).inertia @ (middle - start.v) + 0.5 * pulled
+        return balance_rows(problem, balance, z, self._end(z, problem))
+
+    def finish(self, z: Increment, problem: StepProblem) -> StepEnd:
+        end = self._end(z, problem)
+        # Of the forces of both ends, over the way of the step.
+        at_ends = lambda law: [law(x.q, z.rate, x.t) for x in (problem.start, end)]
+        work = lambda law: 0.5 * problem.h * sum(at_ends(law)) @ z.rate
+        drive_work = self._drive_work(z, problem, end)
+        return StepEnd(
+            end,
+            problem.h * z.rate,
+            0.5 * (z.impulse + z.velocity_impulse) / problem.h,
+            measured_account(problem, end, work, drive_work),
+            None,
+            RESULTS.successful,
+        )
+
+    def _end(self, z: Increment, problem: StepProblem) -> State:
+        q1, t1 = problem.at(z), problem.end_time
+        pulled = self._pulled(problem, q1, z.rate, t1, z.velocity_impulse)
+        v1 = z.rate - 0.5 * (model_of(problem).inverse_inertia @ pulled)
+        return State(q1, v1, t1)
+
+    def _pulled(
+        self,
+        problem: StepProblem,
+        q: Coordinates,
+        middle: Velocities,
+        t: Scalar | None,
+        impulse: Multipliers,
+    ) -> Coordinates:
+        """`-h (F - B^T lambda)` at one end of the step."""
+        model = problem.model
+        slope = model.slope(State(q, middle, t))
+        return problem.h * slope + reaction_force(model, q, t, impulse)
+
+    def _drive_work(self, z: Increment, problem: StepProblem, end: State) -> Scalar | None:
+        """That of all reactions: those of joints that do not move do none."""
+        model, start = problem.model, problem.start
+        if model.system.driven is None:
+            return None
+        before = reaction_force(model, start.q, start.t, z.impulse)
+        after = reaction_force(model, end.q, end.t, z.velocity_impulse)
+        return -0.5 * (before + after) @ z.rate
