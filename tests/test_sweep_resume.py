@@ -97,7 +97,7 @@ FINGERPRINT = """
 import enerjax as ej
 ej.enable_fast_loops()
 import jax
-from enerjax._sweep.fingerprint import _digest
+from enerjax._tools.sweep.fingerprint import _digest
 from tests.test_sweep_resume import stepped
 jax.config.update("jax_enable_x64", True)
 for derivative in (ej.Gonzalez(), ej.MeanValue()):
