@@ -44,3 +44,11 @@ def test_a_success_of_the_wrong_motion_is_flagged():
     _, _, heavy = ej.problems.double_pendulum()
     calm = ej.simulate(system, ej.EnergyPreserving(), start, heavy, h=1e-3, num_steps=500)
     assert calm.phase_error < 1e-3
+
+
+def test_what_hangs_at_rest_has_no_phase_to_lose():
+    system, start, args = ej.problems.pendulum()
+    hanging = ej.initial_state(system, [0.0, 1.0], [0.0, 0.0], args)
+    run = ej.simulate(system, ej.EnergyPreserving(), hanging, args, h=0.05, num_steps=50)
+    # Round-off: the bob moves by 1e-17, as fast as round-off makes it.
+    assert run.phase_error < 1e-6

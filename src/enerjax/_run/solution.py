@@ -87,7 +87,10 @@ class Solution(eqx.Module):
         The local errors of all steps, over the largest velocity. Energy and constraints
         hold at any step; this tells whether the motion is resolved.
         """
-        largest = jnp.nanmax(self.audit.kinetic, axis=-1)
+        kinetic, potential = self.audit.kinetic, self.audit.potential
+        # Below the round-off of the potential energy nothing moves: a system at rest.
+        rest = jnp.finfo(kinetic.dtype).eps * jnp.nanmax(jnp.abs(potential), axis=-1)
+        largest = jnp.maximum(jnp.nanmax(kinetic, axis=-1), rest)
         total = jnp.sum(self.stats.local_error, axis=-1)
         return total / jnp.sqrt(2 * jnp.where(largest > 0, largest, jnp.inf))
 
