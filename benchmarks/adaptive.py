@@ -95,7 +95,8 @@ def our_rows(quick: bool) -> list[harness.Row]:
                 continue
 
             def run(h, controller, scheme=scheme, system=system, start=start, args=args):
-                bound = COUNTS[-1] if controller is None else MAX_STEPS
+                is_fixed = isinstance(controller, ej.EqualSteps)
+                bound = COUNTS[-1] if is_fixed else MAX_STEPS
                 return ej.simulate(
                     system,
                     scheme,
@@ -103,13 +104,13 @@ def our_rows(quick: bool) -> list[harness.Row]:
                     args,
                     h=h,
                     t1=t1,  # noqa: B023
-                    ts=ts,  # noqa: B023
+                    saveat=ej.SaveAt(ts=ts),  # noqa: B023
                     max_steps=bound,
                     controller=controller,
                     throw=False,
                 )
 
-            fixed = jax.jit(lambda h, run=run: run(h, None))
+            fixed = jax.jit(lambda h, run=run: run(h, ej.EqualSteps()))
             varied = jax.jit(lambda tol, run=run: run(1e-3, ej.StepController(tol, tol)))
             of_case = [_row(name, "adaptive", tol, exact, varied) for tol in TOLERANCES] + [
                 _row(name, "fixed", t1 / count, exact, fixed) for count in COUNTS

@@ -55,7 +55,7 @@ def ours(steps: int) -> Callable:
             args | dict(m=m),
             h=h,
             num_steps=steps,
-            save_every=steps,
+            saveat=ej.SaveAt(every=steps),
             throw=False,
         )
         end = solution.ys

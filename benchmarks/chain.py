@@ -70,7 +70,7 @@ def our_rows(quick: bool) -> list[harness.Row]:
         def run(start, args, system=system, steps=steps):
             return ej.simulate(
                 system, ej.EnergyPreserving(), start, args,
-                h=H, num_steps=steps, save_every=steps, throw=False,
+                h=H, num_steps=steps, saveat=ej.SaveAt(every=steps), throw=False,
             )  # fmt: skip
 
         program, seconds = harness.compiled(run, start, args)

@@ -69,7 +69,7 @@ def run(
         args,
         h=h,
         num_steps=steps,
-        save_every=save_every,
+        saveat=ej.SaveAt(every=save_every),
         throw=False,
     )
 

@@ -89,7 +89,7 @@ def simulate(system, scheme, start, args, h, part):
         args,
         h=h / part,
         t1=STEPS * h,
-        ts="steps",
+        saveat=ej.SaveAt(every=1),
         max_steps=STEPS * FINER + 1,
         max_halvings=0,
         throw=False,

@@ -61,7 +61,7 @@ def case_of(make: Callable, kind: str, steps: int) -> tuple[Callable, Callable, 
             p["args"],
             h=p["h"],
             num_steps=steps,
-            save_every=steps,
+            saveat=ej.SaveAt(every=steps),
             throw=False,
         )
         # NaN if the run failed, which no check below lets pass.

@@ -52,7 +52,7 @@ def points(parameters: dict[str, Any], finer: int = 1) -> jax.Array:
         args | p,
         h=H / finer,
         num_steps=STEPS * finer,
-        save_every=EVERY * finer,
+        saveat=ej.SaveAt(every=EVERY * finer),
         throw=False,
     )
     return solution.ys.q[1:]

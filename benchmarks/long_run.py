@@ -65,7 +65,7 @@ def our_rows(quick: bool) -> list[harness.Row]:
                 args,
                 h=h,
                 num_steps=steps,
-                save_every=steps // SAVES,
+                saveat=ej.SaveAt(every=steps // SAVES),
             )
 
         program, _ = harness.compiled(run, start, args, h)

@@ -76,7 +76,7 @@ def _our_run(
             args,
             h=h,
             num_steps=steps,
-            save_every=steps,
+            saveat=ej.SaveAt(every=steps),
             throw=False,
         )
 

@@ -85,7 +85,13 @@ def our_rows(quick: bool) -> list[harness.Row]:
                 start, args, h, *, system=system, scheme=scheme, steps=steps
             ) -> ej.Solution:
                 return ej.simulate(
-                    system, scheme, start, args, h=h, num_steps=steps, save_every=steps
+                    system,
+                    scheme,
+                    start,
+                    args,
+                    h=h,
+                    num_steps=steps,
+                    saveat=ej.SaveAt(every=steps),
                 )
 
             program, seconds = harness.compiled(run, start, args, h)

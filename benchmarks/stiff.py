@@ -72,10 +72,11 @@ def our_rows(quick: bool) -> list[harness.Row]:
 
 
 def _run(
-    scheme: ej.AbstractScheme, h: Any, controller: ej.StepController | None = None
+    scheme: ej.AbstractScheme, h: Any, controller: ej.AbstractController = ej.EqualSteps()
 ) -> ej.Solution:
     system, start, args = ej.problems.stiff_double_pendulum()
-    most = round(END / STEPS[-1]) + 1 if controller is None else None
+    is_fixed = isinstance(controller, ej.EqualSteps)
+    most = round(END / STEPS[-1]) + 1 if is_fixed else None
     return ej.simulate(
         system,
         scheme,

@@ -39,7 +39,7 @@ def consistent() -> Callable:
             args | dict(m=args["m"] * m),
             h=h,
             num_steps=STEPS,
-            save_every=STEPS,
+            saveat=ej.SaveAt(every=STEPS),
             throw=False,
         )
         return solution.ys.q[-1]

@@ -40,7 +40,7 @@ def simulate(
     args=ARGS,
     h=0.01,
     num_steps=4,
-    save_every=1,
+    every=1,
     t0=0.0,
     **system,
 ):
@@ -51,7 +51,7 @@ def simulate(
         args,
         h=h,
         num_steps=num_steps,
-        save_every=save_every,
+        saveat=ej.SaveAt(every=every),
         t0=t0,
     )
 

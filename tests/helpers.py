@@ -89,7 +89,7 @@ def solve(name, scheme, alpha=0.0, *, h, steps, save_every=1):
         args,
         h=h,
         num_steps=steps,
-        save_every=save_every,
+        saveat=ej.SaveAt(every=save_every),
         throw=False,
     )
     return on_host(solution)

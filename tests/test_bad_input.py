@@ -87,7 +87,7 @@ def test_single_precision_is_warned_of_once_and_works():
 
 def test_a_run_that_does_not_fit_into_memory_says_what_to_do():
     system, start, args = problem("pendulum")
-    with pytest.raises(MemoryError, match=r"keeps 10{12} rows.*`save_every`"):
+    with pytest.raises(MemoryError, match=r"10{12} steps.*SaveAt"):
         ej.simulate(system, ej.EnergyPreserving(), start, args, h=1e-3, num_steps=10**12)
 
 

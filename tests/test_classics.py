@@ -12,7 +12,13 @@ SIXTH = ej.Composed(ej.EnergyConsistent(0.0), 6)
 def end(problem, scheme, t, steps):
     system, start, args = problem
     run = ej.simulate(
-        system, scheme, start, args, h=t / steps, num_steps=steps, save_every=steps
+        system,
+        scheme,
+        start,
+        args,
+        h=t / steps,
+        num_steps=steps,
+        saveat=ej.SaveAt(every=steps),
     )
     # Solver: the energy that was there, or turned over.
     scale = max(abs(float(run.audit.energy[0])), float(np.max(run.audit.kinetic)))

@@ -87,7 +87,7 @@ def test_rows_further_apart_sum_the_work():
         h=0.02,
         num_steps=100,
         t0=T0,
-        save_every=5,
+        saveat=ej.SaveAt(every=5),
     )
     sums = run.audit.drive_work[1:].reshape(-1, 5).sum(axis=1)
     np.testing.assert_allclose(thin.audit.drive_work[1:], sums, rtol=0, atol=1e-12)

@@ -55,7 +55,13 @@ def test_a_net_with_loops():
     # One program: the runs of longer steps go on for longer.
     runs = [
         ej.simulate(
-            system, ej.EnergyPreserving(), start, args, h=h, num_steps=100, save_every=25
+            system,
+            ej.EnergyPreserving(),
+            start,
+            args,
+            h=h,
+            num_steps=100,
+            saveat=ej.SaveAt(every=25),
         )
         for h in (4e-3, 2e-3, 1e-3)
     ]
@@ -111,7 +117,7 @@ def test_energy_consistent_on_many_elements_is_of_order_four():
     def end(system, alpha, h):
         scheme, steps = ej.EnergyConsistent(alpha), round(0.1 / h)
         return ej.simulate(
-            system, scheme, start, args, h=h, num_steps=steps, save_every=steps
+            system, scheme, start, args, h=h, num_steps=steps, saveat=ej.SaveAt(every=steps)
         ).ys.q[-1]
 
     far = lambda a, b: float(np.max(np.abs(a - b)))

@@ -86,7 +86,7 @@ def tip(g, steps, save_every):
         args | dict(g=g),
         h=0.02,
         num_steps=steps,
-        save_every=save_every,
+        saveat=ej.SaveAt(every=save_every),
         throw=False,
     )
     return solution.ys.q[-1, 0]

@@ -30,7 +30,7 @@ def oscillation(parameters, h=0.01, steps=200):
         parameters,
         h=h,
         num_steps=steps,
-        save_every=5,
+        saveat=ej.SaveAt(every=5),
         throw=False,
     )
 
@@ -85,7 +85,7 @@ def rods(parameters, state, h, steps, every):
         args | parameters,
         h=h,
         num_steps=steps,
-        save_every=every,
+        saveat=ej.SaveAt(every=every),
         throw=False,
     )
 
@@ -129,7 +129,7 @@ def test_inertias_of_a_body_in_quaternions():
             dict(J=inertia),
             h=5e-3,
             num_steps=100,
-            save_every=100,
+            saveat=ej.SaveAt(every=100),
             throw=False,
         )
         return run.ys.q[-1] - known[0], (run.ys.v[-1] - known[1]) / 20

@@ -218,7 +218,13 @@ def test_the_whip(num_links):
     """At the whip of the longer chain some steps have to be divided."""
     system, start, args = ej.problems.chain(num_links)
     run = ej.simulate(
-        system, ej.EnergyPreserving(), start, args, h=1e-3, num_steps=2000, save_every=10
+        system,
+        ej.EnergyPreserving(),
+        start,
+        args,
+        h=1e-3,
+        num_steps=2000,
+        saveat=ej.SaveAt(every=10),
     )
     turnover = float(jnp.sum(args["m"] * args["g"] * jnp.cumsum(args["l"])))
     length = 1 / num_links

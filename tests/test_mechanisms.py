@@ -29,7 +29,13 @@ def run(problem, scheme, h, steps):
     every = max(steps // 100, 1)
     return on_host(
         ej.simulate(
-            system, SCHEMES[scheme], start, args, h=h, num_steps=steps, save_every=every
+            system,
+            SCHEMES[scheme],
+            start,
+            args,
+            h=h,
+            num_steps=steps,
+            saveat=ej.SaveAt(every=every),
         )
     )
 

@@ -75,7 +75,7 @@ def _check_points(name, steps, bound):
     run = on_host(
         ej.simulate(
             system, ej.EnergyPreserving(), start, args,
-            h=FREE[name], num_steps=steps, save_every=steps // 100,
+            h=FREE[name], num_steps=steps, saveat=ej.SaveAt(every=steps // 100),
         )
     )  # fmt: skip
     linear, angular = _points(run, args)
@@ -117,7 +117,7 @@ def _top(name, h, steps=200, save_every=1):
     run = on_host(
         ej.simulate(
             system, ej.EnergyPreserving(), start, args,
-            h=h, num_steps=steps, save_every=save_every,
+            h=h, num_steps=steps, saveat=ej.SaveAt(every=save_every),
         )
     )  # fmt: skip
     vertical, spin = TOPS[name][0](run, args)
@@ -156,7 +156,13 @@ def test_angles_keep_the_energy_in_long_runs():
     system, start, args = problem("double angles")
     for scheme in (ej.EnergyPreserving(), ej.Composed(ej.EnergyPreserving(), 4)):
         run = ej.simulate(
-            system, scheme, start, args, h=0.01, num_steps=100_000, save_every=1000
+            system,
+            scheme,
+            start,
+            args,
+            h=0.01,
+            num_steps=100_000,
+            saveat=ej.SaveAt(every=1000),
         )
         energy = np.asarray(run.audit.energy)
         assert np.max(np.abs(energy - energy[0])) <= 1e-12 * 9.81 * 3

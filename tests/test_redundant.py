@@ -53,7 +53,13 @@ def _run(num_bars, scheme, h, steps, redundant=True):
     system, args = _beam(num_bars, redundant)
     start = _start(system, args)
     return ej.simulate(
-        system, SCHEMES[scheme](0.5), start, args, h=h, num_steps=steps, save_every=5
+        system,
+        SCHEMES[scheme](0.5),
+        start,
+        args,
+        h=h,
+        num_steps=steps,
+        saveat=ej.SaveAt(every=5),
     )
 
 

@@ -83,7 +83,9 @@ def test_a_hinge_in_space_counts_its_turns(body):
         args=dict(c=0.0),
     )
     system, start, args = scene.build()
-    simulate = functools.partial(ej.simulate, h=2e-3, num_steps=2500, save_every=500)
+    simulate = functools.partial(
+        ej.simulate, h=2e-3, num_steps=2500, saveat=ej.SaveAt(every=500)
+    )
     near = functools.partial(np.testing.assert_allclose, rtol=0, atol=2e-3)  # truncation
     for c in (0.0, 0.1):
         now = args.set(c=c)

@@ -12,7 +12,9 @@ def run(name, h, steps, every):
     system, start, args = getattr(ej.problems, name)()
     scheme = ej.Composed(ej.EnergyPreserving(), 4)
     return on_host(
-        ej.simulate(system, scheme, start, args, h=h, num_steps=steps, save_every=every)
+        ej.simulate(
+            system, scheme, start, args, h=h, num_steps=steps, saveat=ej.SaveAt(every=every)
+        )
     )
 
 

@@ -25,7 +25,10 @@ from ._discrete import (
 from ._programs import enable_fast_loops as enable_fast_loops
 from ._results import RESULTS as RESULTS
 from ._run import (
+    AbstractController as AbstractController,
     Audit as Audit,
+    EqualSteps as EqualSteps,
+    SaveAt as SaveAt,
     simulate as simulate,
     Solution as Solution,
     Statistics as Statistics,

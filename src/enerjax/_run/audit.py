@@ -1,7 +1,6 @@
 """Energies, momenta and constraint residuals along a run, to judge it by."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -9,6 +8,7 @@ from jaxtyping import Array, Float
 from .._operators import AbstractModel
 from .._programs import is_known
 from .._system import State
+from .._types import Scalar
 from ..schemes import Energies
 
 
@@ -59,35 +59,41 @@ class Audit(eqx.Module):
         return _report(self) if is_known(self) else repr(self)
 
 
-def audit(
-    model: AbstractModel,
-    states: State,
-    energies: Energies,
-) -> Audit:
-    """The audit of states, and of the energies between them, with a leading time axis."""
+class Measures(eqx.Module):
+    """What the audit tells of one state; the names are those of `Audit`."""
 
-    def at(state: State):
-        return (
-            model.kinetic(state),
-            model.potential(state),
-            model.symmetry_momenta(state),
-            model.constraint(state.q, state.t),
-            model.joint_rate(state.q, state.v, state.t),
-        )
+    kinetic: Scalar
+    potential: Scalar
+    momentum: Float[Array, " ns"]
+    constraint: Float[Array, " nc"]
+    constraint_rate: Float[Array, " nj"]
 
-    kinetic, potential, momentum, constraint, rate = jax.vmap(at)(states)
+
+def measures(model: AbstractModel, state: State) -> Measures:
+    """Energies, momenta and residuals of the constraints in a state."""
+    return Measures(
+        kinetic=model.kinetic(state),
+        potential=model.potential(state),
+        momentum=model.symmetry_momenta(state),
+        constraint=model.constraint(state.q, state.t),
+        constraint_rate=model.joint_rate(state.q, state.v, state.t),
+    )
+
+
+def audit(rows: Measures, energies: Energies) -> Audit:
+    """The audit of rows, and of the energies between them, with a leading time axis."""
     # Where a row is not a number, none of its entries is.
     none = 0 * energies.dissipated
     return Audit(
-        kinetic,
-        potential,
-        energies.dissipated,
-        none if energies.work is None else energies.work,
-        none if energies.damped is None else energies.damped,
-        none if energies.drive_work is None else energies.drive_work,
-        momentum,
-        constraint,
-        rate,
+        kinetic=rows.kinetic,
+        potential=rows.potential,
+        dissipated=energies.dissipated,
+        work=none if energies.work is None else energies.work,
+        damped=none if energies.damped is None else energies.damped,
+        drive_work=none if energies.drive_work is None else energies.drive_work,
+        momentum=rows.momentum,
+        constraint=rows.constraint,
+        constraint_rate=rows.constraint_rate,
     )
 
 
@@ -115,7 +121,7 @@ def _report(audit: Audit) -> str:
         lines.append((f"momentum {k}, largest change", largest(drift)))
     done = rows.sum(axis=-1)
     what = f"{rows.shape[-1]} rows" + (
-        "" if rows.all() else f", {done.min()} of them before a failure"
+        "" if rows.all() else f", {done.min()} of them reached"
     )
     if rows.ndim > 1:
         what += f", the worst of {rows[..., 0].size} runs"

@@ -16,9 +16,9 @@ from .._system import State
 from .._types import Count, Flag, Real, Scalar
 from ..schemes import AbstractCarryingSolve, AbstractScheme
 from .collocation import end_of, Pair, rates, rates_along
-from .pace import AbstractPace, Verdict
 from .prediction import for_length, with_history
 from .step import StepOutput, Warm
+from .step_sizes import AbstractController, AbstractPlan, End, Verdict
 
 
 def _as_tolerance(tolerance: Real) -> Scalar:
@@ -32,7 +32,7 @@ def _as_tolerance(tolerance: Real) -> Scalar:
     return array
 
 
-class StepController(eqx.Module):
+class StepController(AbstractController):
     """Chooses the steps of `simulate(..., t1=..., controller=...)` by their errors.
 
     Each step is compared with the integral of the equations of motion along it: Picard's
@@ -64,6 +64,31 @@ class StepController(eqx.Module):
     rtol: Scalar = eqx.field(converter=_as_tolerance)
     atol: Scalar = eqx.field(converter=_as_tolerance)
 
+    def plan(
+        self, scheme: AbstractScheme, h: Scalar, t0: Scalar, end: End
+    ) -> "_ControlledPlan":
+        if isinstance(scheme.stage, AbstractCarryingSolve):
+            raise ValueError(
+                f"`{type(scheme).__name__}` carries an acceleration from step to step that "
+                "belongs to one length of the steps, so no `controller` can vary it. Give "
+                "`h` and `t1` alone, or take a scheme of one step, such as "
+                "`EnergyDecaying`."
+            )
+        assert end.t1 is not None
+        duration = end.t1 - t0
+        return _ControlledPlan(
+            t0=t0,
+            t1=end.t1,
+            unit=duration,
+            last=jnp.ones_like(duration),
+            max_attempts=MAX_STEPS if end.max_steps is None else end.max_steps,
+            is_counted=False,
+            controller=self,
+            first_length=h / duration,
+            order=scheme.order,
+            stages=scheme.stages,
+        )
+
 
 class _Memory(eqx.Module):
     # Of the step to come, and of the last three that were accepted, newest first.
@@ -71,7 +96,9 @@ class _Memory(eqx.Module):
     before: Float[Array, "3"]
     # Of the last accepted step.
     error: Scalar
-    # Whether a step was rejected since, and whether one was for its error.
+    # How many steps were rejected in the run; whether one was since the last accepted
+    # step, and whether one was for its error.
+    num_rejected: Count
     rejected: Flag
     inaccurate: Flag
     # The rates of change in the state that is reached.
@@ -84,9 +111,20 @@ _SAFETY = 0.9
 _SHORTER, _LONGER = 0.2, 5.0
 
 
-class ControlledSteps(AbstractPace):
-    """The steps of a `StepController`. Nothing is differentiated by their lengths."""
+# Steps that a controller may try, if nothing else is said.
+MAX_STEPS = 4096
 
+
+class _ControlledPlan(AbstractPlan):
+    """The steps of a `StepController`, as parts of the whole time. Nothing is
+    differentiated by their lengths."""
+
+    t0: Scalar
+    t1: Scalar
+    unit: Scalar
+    last: Scalar
+    max_attempts: int = eqx.field(static=True)
+    is_counted: bool = eqx.field(static=True)
     controller: StepController
     first_length: Scalar
     order: int = eqx.field(static=True)
@@ -97,20 +135,26 @@ class ControlledSteps(AbstractPace):
         at_start = _constant(rates(model, start))
         same, one = jnp.full((3,), first), jnp.ones_like(first)
         no = jnp.array(False)
-        return _Memory(first, same, one, no, no, at_start)
+        return _Memory(
+            length=first,
+            before=same,
+            error=one,
+            num_rejected=jnp.array(0),
+            rejected=no,
+            inaccurate=no,
+            rates=at_start,
+        )
 
     def first(self) -> Scalar:
         return jax.lax.stop_gradient(jnp.minimum(self.first_length, 1.0))
 
-    def next(
-        self, memory: _Memory, begin: Scalar, completed: Count
-    ) -> tuple[Scalar, Scalar]:
-        # The last two steps share what is left, and none is tiny.
-        left = 1 - begin
+    def next(self, memory: _Memory, place: Scalar) -> tuple[Scalar, Scalar]:
+        # The last two steps share the rest of the time, so that none is tiny.
+        left = 1 - place
         last = left <= 1.01 * memory.length
         length = jnp.minimum(memory.length, 0.5 * left)
         length = jnp.where(last, left, length)
-        return jnp.where(last, 1.0, begin + length), length
+        return jnp.where(last, 1.0, place + length), length
 
     def warm(self, memory: _Memory, warm: Warm, length: Scalar) -> Warm:
         return for_length(warm, self.stages, memory.before, length)
@@ -124,10 +168,9 @@ class ControlledSteps(AbstractPace):
         model: AbstractModel,
         begin: State,
         out: StepOutput,
-        h: Scalar,
         length: Scalar,
     ) -> Verdict:
-        known = _constant((model, begin, out.state, h, memory.rates))
+        known = _constant((model, begin, out.state, self.unit * length, memory.rates))
         error, reached = _constant(self._error(*known))
         solved = out.result == RESULTS.successful
         accepted = solved & (error <= 1)
@@ -148,14 +191,18 @@ class ControlledSteps(AbstractPace):
         before = jnp.concatenate([length[None], memory.before[:2]])
         choose = lambda new, old: jnp.where(accepted, new, old)
         after = _Memory(
-            next_length,
-            choose(before, memory.before),
-            choose(error, memory.error),
-            ~accepted,
-            inaccurate,
-            jax.tree.map(choose, reached, memory.rates),
+            length=next_length,
+            before=choose(before, memory.before),
+            error=choose(error, memory.error),
+            num_rejected=memory.num_rejected + jnp.where(accepted, 0, 1),
+            rejected=~accepted,
+            inaccurate=inaccurate,
+            rates=jax.tree.map(choose, reached, memory.rates),
         )
         return Verdict(accepted, RESULTS.where(too_short, cause, RESULTS.successful), after)
+
+    def num_rejected(self, memory: _Memory) -> Count:
+        return memory.num_rejected
 
     def _error(
         self, model: AbstractModel, a: State, b: State, h: Scalar, at_start: Pair
@@ -198,22 +245,3 @@ def other_end(
     nodes = max(order if order <= 4 else order - 2, 3)
     f = rates_along(model, a, b, h, at_ends, nodes, nodes - 3)
     return end_of(a, h, f, b.t)
-
-
-def controlled(
-    controller: StepController, scheme: AbstractScheme, first_length: Scalar
-) -> ControlledSteps:
-    """The steps of a scheme, the first of which is a part `first_length` of the run."""
-    if not isinstance(controller, StepController):
-        raise TypeError(
-            "`controller` must be a `StepController(rtol, atol)`, got "
-            f"{controller!r}"
-            + (": the parentheses are missing." if controller is StepController else ".")
-        )
-    if isinstance(scheme.stage, AbstractCarryingSolve):
-        raise ValueError(
-            f"`{type(scheme).__name__}` carries an acceleration from step to step that "
-            "belongs to one length of the steps, so no `controller` can vary it. Give `h` "
-            "and `t1` alone, or take a scheme of one step, such as `EnergyDecaying`."
-        )
-    return ControlledSteps(controller, first_length, scheme.order, scheme.stages)

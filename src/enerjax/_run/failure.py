@@ -5,6 +5,7 @@ from collections.abc import Iterator
 
 import equinox as eqx
 import jax
+import numpy as np
 
 from .._analysis import mobility
 from .._programs import is_known
@@ -38,8 +39,8 @@ def raise_failure(
         when = f"from t = {begin:.6g} to {begin + float(h):.6g}"
     message = f"The run failed in step {done + 1}, {when}. {RESULTS[solution.result]} "
     if solution.result == RESULTS.not_converged:
-        rejected = solution.stats.rejected_steps
-        tried = done if rejected is None else done + int(rejected) - 1
+        # The steps of the last row that took any iteration; the others have converged.
+        tried = np.flatnonzero(np.asarray(solution.stats.newton_iterations))[-1]
         residual = float(solution.stats.residual[tried])
         message += f"It came to a residual of {residual:.1e}, scaled to order one. "
     if solution.result in (RESULTS.not_converged, RESULTS.singular, RESULTS.nonfinite):
@@ -48,7 +49,7 @@ def raise_failure(
 
 
 @contextlib.contextmanager
-def memory_told(num_steps: int, num_rows: int) -> Iterator[None]:
+def memory_told(num_steps: int) -> Iterator[None]:
     """Says of a run that does not fit into memory what takes it, and what to do."""
     try:
         yield
@@ -56,10 +57,10 @@ def memory_told(num_steps: int, num_rows: int) -> Iterator[None]:
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
         raise MemoryError(
-            f"A run of {num_steps} steps that keeps {num_rows} rows, and three numbers for "
-            "each step, does not fit into memory. Keep fewer rows (`save_every`), and let "
-            "a run that is longer still go on in parts: each starts from `solution.end` of "
-            "the one before."
+            f"This run of {num_steps} steps does not fit into memory. Keep fewer rows: "
+            "`saveat=SaveAt(every=1000)`, or `SaveAt(fn=...)`, which keeps a function of "
+            "the state. A run that is longer still can go on in parts: each starts from "
+            "`solution.end` of the one before."
         ) from error
 
 

@@ -35,21 +35,21 @@ def keep_roots(fn: Body) -> Body:
     return _checkpoint(fn, policy=jax.checkpoint_policies.save_only_these_names(ROOT))
 
 
-def scans(rows: int, steps: int) -> tuple[Scan, Scan]:
-    """The loops over the rows of a run, and over the steps of a row."""
-    total = rows * steps
-    segment = math.isqrt(total)
-    # One of both loops is cut: a segment is a group of rows, or a part of one.
-    if steps > segment:
-        return jax.lax.scan, functools.partial(_in_segments, total, segment)
-    return functools.partial(_in_segments, total, segment // steps), jax.lax.scan
+def loops(
+    groups: int, steps: int, done: Callable[[Any], Array] | None
+) -> tuple[Scan, Scan]:
+    """The loops over the groups of steps of a run, and over the steps of a group.
 
-
-def scan_until(done: Callable[[Any], Array], length: int) -> Scan:
-    """A loop of at most `length` steps, over once `done(carry)`: what is left of its
-    segments costs nothing then, and what it hands out there is zero. In a batch the last
-    lane decides."""
-    return functools.partial(_in_segments, length, math.isqrt(length), done=done)
+    Segments that begin after `done(carry)` cost nothing, and what they hand out is zero; of
+    a batch the last lane decides. `None` where all of them are needed.
+    """
+    total = groups * steps
+    length = math.isqrt(total)
+    # One of both loops is cut: a segment consists of whole groups, or is a part of one.
+    if steps > length:
+        return jax.lax.scan, functools.partial(_in_segments, total, length, done=done)
+    in_segments = functools.partial(_in_segments, total, length // steps, done=done)
+    return in_segments, jax.lax.scan
 
 
 def _in_segments(

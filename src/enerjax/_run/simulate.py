@@ -1,35 +1,24 @@
-from typing import Literal
+"""Whole runs."""
+
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import PyTree
 
 from .._operators import make_model
-from .._results import first_failure, RESULTS
 from .._solvers import Newton, RootFinder
 from .._system import AbstractSystem, State
-from .._types import Args, Count, Flag, Real, Vector
+from .._types import Args, Real, Scalar
 from ..schemes import AbstractScheme
-from .audit import audit
-from .controller import StepController
+from .audit import audit, Measures, measures
 from .failure import memory_told, raise_failure
-from .inputs import check_halvings, positive_integer, prepare
-from .reverse import keep_roots, scans
-from .selection import check_start, nan_unless, select
+from .inputs import check_halvings, prepare
+from .loop import run_loop, Stepper
+from .saving import AbstractSaving, SaveAt, SaveFunction, saving_of
 from .solution import Solution, Statistics
-from .step import advance, first_warm, Warm
-from .times import check_form
-from .to_time import simulate_until
-
-
-class _Carry(eqx.Module):
-    """What one step hands to the next; the last good state once a step has failed."""
-
-    state: State
-    warm: Warm
-    result: RESULTS
-    completed: Count
+from .step_sizes import AbstractController, AbstractPlan, EqualSteps, find_end
 
 
 def simulate(
@@ -41,11 +30,10 @@ def simulate(
     h: Real,
     num_steps: int | None = None,
     t1: Real | None = None,
-    ts: Vector | Literal["steps"] | None = None,
-    max_steps: int | None = None,
-    controller: StepController | None = None,
     t0: Real = 0.0,
-    save_every: int = 1,
+    saveat: SaveAt = SaveAt(),
+    controller: AbstractController = EqualSteps(),
+    max_steps: int | None = None,
     root_finder: RootFinder = Newton(),
     max_halvings: int | None = None,
     throw: bool = True,
@@ -65,25 +53,21 @@ def simulate(
     - `start`: a `State` that satisfies the constraints, as `initial_state` makes it.
     - `args`: any pytree, handed to the functions of the system.
     - `h`: length of a step (time), positive.
-    - `num_steps`, `save_every`: every `save_every`-th state is saved, and the start. Their
-      quotient must be whole. In reverse mode the solved unknowns of each step are stored
-      too, up to 10^4 steps; beyond, memory grows like the square root of the steps, at
-      the cost of one more run.
-    - `t1`: instead of these, the time of the end, traced. The number of steps is
+    - `num_steps`: how many steps of the length `h` the run has.
+    - `t1`: instead of this, the time of the end, traced. The number of steps is
       `(t1 - t0)/h`, rounded up but for round-off, and `h` is shortened to fit: lanes of
       different `h` end at the same time, in one program.
-    - `ts`: with `t1`, the times of the rows, `(times,)`, ascending; or `"steps"`: the start
-      and the end of every step, `max_steps + 1` rows, NaN after the last; without it `t0`
-      and `t1`. Within a step the state is interpolated to the order of the scheme and moved
-      onto the constraints; at its end it is the state itself. With `ts` memory grows with
-      `max_steps`.
+    - `t0`: the time of the start; step `k` begins at `t0 + k h`. Traced.
+    - `saveat`: which states become the rows of the solution; see `SaveAt`. In reverse mode
+      the solved unknowns of each step are stored too, up to 10^4 steps; beyond, memory
+      grows like the square root of the steps, at the cost of one more run.
+    - `controller`: `EqualSteps()`, or with `t1` a `StepController(rtol, atol)` that varies
+      the steps; `h` is the first. Derivatives are those of the steps as they were chosen,
+      as parts of `t1 - t0`.
     - `max_steps`: with `t1`, a bound on the steps, rejected ones included; a run that
       needs more fails. Without it the number of steps where it is known, and with a
       controller 4096. Steps that are left cost nothing; of a batch those after its last
       lane.
-    - `controller`: with `t1`, a `StepController` that varies the steps; `h` is the first.
-      Derivatives are those of the steps as they were chosen, as parts of `t1 - t0`.
-    - `t0`: the time of the start; step `k` begins at `t0 + k h`. Traced.
     - `root_finder`: for the step equations, which are scaled to order one (so tolerances
       are relative); one of optimistix can be given, or a solver of its for least squares.
     - `max_halvings`: a step that fails is tried again in 2, 4, up to `2 ** max_halvings`
@@ -99,122 +83,92 @@ def simulate(
     **Raises:** `ValueError` or `TypeError` for bad input, before any step;
     `equinox.EquinoxRuntimeError` for a failed run if `throw`.
     """
-    check_form(num_steps, save_every, t1, ts, max_steps, controller)
+    if not isinstance(saveat, SaveAt):
+        raise TypeError(f"`saveat` must be a `SaveAt`, got {saveat!r}.")
     check_halvings(max_halvings)
-    if num_steps is None:
-        times = t0, t1, ts
-        return simulate_until(
-            system,
-            scheme,
-            start,
-            args,
-            h,
-            times,
-            max_steps,
-            controller,
-            root_finder,
-            max_halvings,
-            throw,
-        )
-    num_steps = positive_integer("num_steps", num_steps)
-    save_every = positive_integer("save_every", save_every)
-    if num_steps % save_every != 0:
-        raise ValueError(
-            f"`num_steps` ({num_steps}) must be a multiple of `save_every` ({save_every})."
-        )
-    start, args, h, t0 = prepare(system, scheme, start, args, h, t0, root_finder)
-    with memory_told(num_steps, num_steps // save_every):
-        solution = _run(
-            system,
-            scheme,
-            start,
-            args,
-            h,
-            t0,
-            root_finder,
-            max_halvings,
-            num_steps,
-            save_every,
-        )
+    start, args, step, begin = prepare(system, scheme, start, args, h, t0, root_finder)
+    end = find_end(num_steps, t1, max_steps, controller, h, t0, step.dtype)
+    plan = controller.plan(scheme, step, begin, end)
+    task = _Task(
+        system=system,
+        scheme=scheme,
+        start=start,
+        args=args,
+        plan=plan,
+        saving=saving_of(saveat, plan, controller),
+        fn=saveat.fn,
+        root_finder=root_finder,
+        max_halvings=max_halvings,
+    )
+    with memory_told(plan.max_attempts):
+        solution, reached = _run(task)
     if not throw:
         return solution
-    reached = t0 + h * solution.stats.completed_steps.astype(h.dtype)
-    return raise_failure(solution, system, args, reached, h)
+    equal = plan.unit if isinstance(controller, EqualSteps) else None
+    return raise_failure(solution, system, args, reached, equal)
+
+
+class _Task(eqx.Module):
+    """A run, checked: the arguments of `simulate`."""
+
+    system: AbstractSystem
+    scheme: AbstractScheme
+    start: State
+    args: Args
+    plan: AbstractPlan
+    saving: AbstractSaving
+    fn: SaveFunction | None
+    root_finder: RootFinder
+    max_halvings: int | None
 
 
 @eqx.filter_jit
-def _run(
-    system,
-    scheme,
-    start,
-    args,
-    h,
-    t0,
-    root_finder,
-    max_halvings,
-    num_steps,
-    save_every,
-):
-    model = make_model(system, start, args)
-    start = model.enter(start)
-    acceleration, multipliers0 = model.accelerations(start)
-    warm = first_warm(scheme, model, start, h, acceleration, multipliers0)
+def _run(task: _Task) -> tuple[Solution, Scalar]:
+    """The run, and the time that it has reached."""
+    plan, saving, fn = task.plan, task.saving, task.fn
+    model = make_model(task.system, task.start, task.args)
 
-    def timed(state: State, steps: Array) -> State:
-        """With the time after some steps, counted and not summed up, where time enters."""
-        return State(state.q, state.v, t0 + h * steps if system.is_timed else None)
+    def observe(state: State, t: Scalar) -> tuple[PyTree[Any], Measures]:
+        """What users are given of a state, and what the audit tells of it."""
+        told: PyTree[Any] = model.leave(state)
+        if fn is not None:
+            told = jax.tree.map(jnp.asarray, fn(t, told, task.args))
+        timed = State(state.q, state.v, t if task.system.is_timed else None)
+        return told, measures(model, timed)
 
-    def one_step(carry: _Carry, live: Flag):
-        skip = (carry.result != RESULTS.successful) | ~live
-        begin = timed(carry.state, carry.completed.astype(h.dtype))
-        out = advance(scheme, model, begin, h, carry.warm, root_finder, skip, max_halvings)
-        result = first_failure(carry.result, out.result)
-        result = RESULTS.where(live, result, carry.result)
-        good = live & (result == RESULTS.successful)
-        reached = State(out.state.q, out.state.v)
-        state, memory = select(good, (reached, out.warm), (carry.state, carry.warm))
-        completed = carry.completed + good.astype(carry.completed.dtype)
-        reported = (out.multipliers, out.details)
-        return _Carry(state, memory, result, completed), (
-            reported,
-            jax.tree.map(lambda x: jnp.where(good, x, 0), out.energies),
-            jax.tree.map(
-                lambda x: jnp.where(skip, 0, x),
-                (out.newton_iterations, out.residual, out.halvings, out.local_error),
-            ),
-        )
+    # A function of the state is evaluated in the loop, so that no states are stored;
+    # without one all rows are judged together after the loop, which is faster.
+    at_once = fn is not None and saving.keeps_rows
 
-    num_saves = num_steps // save_every
-    scan_of_rows, scan_of_steps = scans(num_saves, save_every)
+    def keep(state: State, place: Scalar) -> PyTree[Any]:
+        return observe(state, plan.time(place)) if at_once else state
 
-    def one_save(carry: _Carry, live: Flag):
-        carry, (reported, energies, costs) = scan_of_steps(
-            keep_roots(one_step), carry, jnp.full((save_every,), live)
-        )
-        last = jax.tree.map(lambda x: x[-1], reported)
-        row = (carry.state, *last, jax.tree.map(jnp.sum, energies))
-        good = carry.result == RESULTS.successful
-        return carry, (nan_unless(good, row), costs)
-
-    result0 = check_start(scheme, model, start, h)
-    begin = _Carry(State(start.q, start.v), warm, result0, jnp.array(0))
-    end, (rows, costs) = scan_of_rows(one_save, begin, jnp.ones((num_saves,), bool))
-    states, multipliers, details, energies = rows
-    row0 = (begin.state, multipliers0, jax.tree.map(lambda _: jnp.zeros_like(h), energies))
-    states, multipliers, energies = jax.tree.map(
-        lambda first, rest: jnp.concatenate([first[None], rest]),
-        row0,
-        (states, multipliers, energies),
+    stepper = Stepper(
+        scheme=task.scheme,
+        model=model,
+        plan=plan,
+        root_finder=task.root_finder,
+        max_halvings=task.max_halvings,
     )
-    costs = [x.reshape(-1) for x in costs]
-    saved = jnp.arange(0, num_steps + 1, save_every, dtype=h.dtype)
-    return Solution(
-        t0 + h * saved,
-        jax.vmap(model.leave)(states),
-        multipliers,
-        details,
-        audit(model, timed(states, saved), energies),
-        Statistics(*costs, completed_steps=end.completed),
-        model.leave(end.state),
-        end.result,
+    start = model.enter(task.start)
+    begin, end, record = run_loop(stepper, start, saving.steps_in_group(plan), keep)
+    rows = saving.rows(model, plan, begin, record, end.completed, task.scheme.order)
+    ys, told = rows.kept if at_once else jax.vmap(observe)(rows.kept, rows.ts)
+    solution = Solution(
+        ts=rows.ts,
+        ys=ys,
+        multipliers=rows.multipliers,
+        details=rows.details,
+        audit=audit(told, rows.energies),
+        stats=Statistics(
+            newton_iterations=rows.costs.iterations,
+            residual=rows.costs.residual,
+            halvings=rows.costs.halvings,
+            local_error=rows.costs.local_error,
+            completed_steps=end.completed,
+            rejected_steps=plan.num_rejected(end.memory),
+        ),
+        end=model.leave(end.state),
+        result=end.result,
     )
+    return solution, plan.time(end.place)

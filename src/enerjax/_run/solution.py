@@ -13,30 +13,30 @@ from .audit import Audit
 
 
 class Statistics(eqx.Module):
-    """What a run cost.
+    """What a run cost: for each row after the start, the steps since the row before.
 
-    - `newton_iterations`: of each step, shape `(num_steps,)`; 0 after a failure. Those of
-      all stages together where a step has several (`Composed`).
-    - `residual`: of each step, the largest entry of the step equations, scaled to order
-      one, before the last correction; of the step that failed what Newton came to.
-    - `halvings`: of each step, how often it had to be halved; see `simulate`.
-    - `local_error`: of each step, an estimate of what it is off by, as the square root of
-      an energy: of the velocities, weighted by the root of the inertia. By how they change
-      from step to step, and the order of the scheme; a guide, and no bound. The estimates
-      of all steps, over the root of twice the largest kinetic energy, tell to which part
-      of the motion its phase can be believed at most: see `phase_error`.
+    Shape `(times - 1,)`, one entry a step where every step is saved. At requested times
+    the shape is `(times,)`, for the first of them need not be the start.
+
+    - `newton_iterations`: of these steps together; 0 after a failure. Those of all stages
+      count where a step has several (`Composed`), and those of rejected steps.
+    - `residual`: the largest entry of the step equations, scaled to order one, before the
+      last correction; of a step that failed what Newton came to.
+    - `halvings`: how often one of these steps had to be halved, at most; see `simulate`.
+    - `local_error`: an estimate of what these steps are off by together, as the square root
+      of an energy: of the velocities, weighted by the root of the inertia. By how they
+      change from step to step, and the order of the scheme; a guide, and no bound. The
+      estimates of all steps, over the root of twice the largest kinetic energy, tell to
+      which part of the motion its phase can be believed at most: see `phase_error`.
     - `completed_steps`: number of steps before the first failure, or all.
     - `rejected_steps`: of a run with a `StepController`, how many steps were repeated with
       another length, the last one of a failed run included; else `None`.
-
-    In a run to an end time there is room for `max_steps`; with a controller rejected steps
-    count and stand among the others.
     """
 
-    newton_iterations: Int[Array, " steps"]
-    residual: Float[Array, " steps"]
-    halvings: Int[Array, " steps"]
-    local_error: Float[Array, " steps"]
+    newton_iterations: Int[Array, " rows"]
+    residual: Float[Array, " rows"]
+    halvings: Int[Array, " rows"]
+    local_error: Float[Array, " rows"]
     completed_steps: Count
     rejected_steps: Count | None = None
 
@@ -47,7 +47,8 @@ class Solution(eqx.Module):
     Row 0 is the start, unless other times were requested.
 
     - `ts`: shape `(times,)`, from `t0` on (time).
-    - `ys`: a `State` with `q` of shape `(times, nq)` and `v` of shape `(times, nv)`.
+    - `ys`: a `State` with `q` of shape `(times, nq)` and `v` of shape `(times, nv)`, or
+      what `SaveAt(fn=...)` made of the states.
     - `multipliers`: shape `(times, nc)`, `lambda` of the step that ends at each row:
       joints, driven constraints, relations between coordinates, in this order; row 0 those
       of the consistent start. The force on the coordinates is `-B^T lambda`.
@@ -61,18 +62,18 @@ class Solution(eqx.Module):
 
     Rows after a failed step are NaN; those before it are what they would be without it.
 
-    At times that were requested (`simulate(..., t1=..., ts=...)`) multipliers and details
+    At times that were requested (`saveat=SaveAt(ts=...)`) multipliers and details
     are those of the step that a row lies in or ends. The energies of the audit are those of
     its state; dissipation and work are those of the steps that have ended since the row
     before (of the first row since the start). So the balance of the audit is exact between
-    rows at the ends of steps: the start, the end, and all rows of `ts="steps"`.
+    rows at the ends of steps: the start, the end, and all rows of `SaveAt(every=...)`.
 
     `print` tells the outcome, the steps and what Newton's method took for them, and the
     account of the energy; of a batch all lanes together.
     """
 
     ts: Float[Array, " times"]
-    ys: State
+    ys: PyTree[Any]
     multipliers: Float[Array, "times nc"]
     details: PyTree[Any]
     audit: Audit
@@ -104,19 +105,19 @@ def _report(solution: Solution) -> str:
     iterations, halvings = (
         np.asarray(x) for x in (stats.newton_iterations, stats.halvings)
     )
-    made = iterations[iterations > 0]
+    made = np.sum(iterations)
     outcome, steps = tally(solution.result), f"{done}"
     if done.ndim == 0:
         outcome = outcome.removeprefix("1 ")
     else:
         outcome = f"{done.size} lanes: {outcome}"
         steps = f"{done.min()} to {done.max()}"
-    rows = f"rows from t = {times.min():.6g} to {times.max():.6g}"
+    rows = f"rows from t = {np.nanmin(times):.6g} to {np.nanmax(times):.6g}"
     lines = [outcome, f"{steps} steps, {rows}"]
-    if made.size > 0:
-        lines.append(f"{np.mean(made):.1f} iterations a step, at most {np.max(made)}")
+    if np.sum(done) > 0:
+        lines.append(f"{made / np.sum(done):.1f} iterations a step")
     if np.any(halvings > 0):
-        divided = f"{np.sum(halvings > 0)} steps divided"
+        divided = f"steps divided before {np.sum(halvings > 0)} rows"
         lines.append(f"{divided}, into up to {2 ** halvings.max()} parts")
     if stats.rejected_steps is not None:
         lines.append(f"{np.sum(stats.rejected_steps)} steps repeated with another length")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..._operators import make_model
 from ..._results import RESULTS
-from ..._run import simulate, Solution
+from ..._run import SaveAt, simulate, Solution
 from ..._system import AbstractSystem, State
 from ..._types import Args, Scalar
 from ...schemes import AbstractScheme, Composed, EnergyPreserving
@@ -35,7 +35,7 @@ class Task:
     times: Reals
 
     def rows(self, num_steps: int) -> tuple[int, NDArray[np.int_]]:
-        """`save_every` of a run that passes all times, and its rows there."""
+        """After how many steps a run saves that passes all times, and its rows there."""
         counts = num_steps * (self.times - self.t0) / self.duration
         whole = np.rint(counts).astype(int)
         # A time between steps would be measured against an interpolant.
@@ -47,16 +47,16 @@ class Task:
                 f"not pass t = {time:g}, where the reference is given. Leave this time "
                 "out, or choose numbers of steps of which one ends there."
             )
-        save_every = math.gcd(num_steps, *whole.tolist())
-        return save_every, whole // save_every
+        every = math.gcd(num_steps, *whole.tolist())
+        return every, whole // every
 
     def run(self, scheme: AbstractScheme, num_steps: int) -> Solution:
         """A run of a compiled program; a failure is left in its `result`."""
         h = jnp.asarray(self.duration / num_steps, self.start.q.dtype)
         t0 = jnp.asarray(self.t0, h.dtype)
-        save_every, _ = self.rows(num_steps)
+        every, _ = self.rows(num_steps)
         start = State(self.start.q, self.start.v)
-        solution = _run(self.system, scheme, start, self.args, h, t0, num_steps, save_every)
+        solution = _run(self.system, scheme, start, self.args, h, t0, num_steps, every)
         return jax.block_until_ready(solution)
 
 
@@ -69,7 +69,7 @@ def _run(
     h: Scalar,
     t0: Scalar,
     num_steps: int,
-    save_every: int,
+    every: int,
 ) -> Solution:
     return simulate(
         system,
@@ -79,7 +79,7 @@ def _run(
         h=h,
         num_steps=num_steps,
         t0=t0,
-        save_every=save_every,
+        saveat=SaveAt(every=every),
         throw=False,
     )
 

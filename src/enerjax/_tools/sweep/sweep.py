@@ -29,7 +29,7 @@ def sweep(
         def lost(alpha, h):
             scheme = ej.EnergyConsistent(alpha)
             sol = ej.simulate(
-                system, scheme, start, args, h=h, num_steps=500, save_every=500, throw=False
+                system, scheme, start, args, h=h, num_steps=500, saveat=..., throw=False
             )
             return {"energy": sol.audit.energy[-1], "result": sol.result}
 

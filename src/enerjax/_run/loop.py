@@ -1,0 +1,193 @@
+"""The loop over the steps of a run."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import PyTree
+
+from .._operators import AbstractModel
+from .._results import first_failure, RESULTS
+from .._solvers import RootFinder
+from .._system import State
+from .._types import Count, Flag, Multipliers, Scalar
+from ..schemes import AbstractScheme, Energies
+from .reverse import keep_roots, loops
+from .saving import Begin, Costs, Record, with_time
+from .step import advance, first_warm, Warm
+from .step_sizes import AbstractPlan
+
+
+class Progress(eqx.Module):
+    """How far a run has come: what one step hands to the next.
+
+    Once a step has failed it is the last good state.
+    """
+
+    state: State
+    warm: Warm
+    place: Scalar
+    memory: PyTree[Any]
+    result: RESULTS
+    completed: Count
+    multipliers: Multipliers
+
+
+class Stepper(eqx.Module):
+    """Everything that a step needs and no step changes."""
+
+    scheme: AbstractScheme
+    model: AbstractModel
+    plan: AbstractPlan
+    root_finder: RootFinder
+    max_halvings: int | None = eqx.field(static=True)
+
+    def begin(self, start: State) -> Progress:
+        """A run that begins at `start`, a state of the model."""
+        scheme, model, plan = self.scheme, self.model, self.plan
+        acceleration, multipliers = model.accelerations(start)
+        h = plan.unit * plan.first()
+        place = jnp.zeros_like(plan.last)
+        timed = with_time(model, plan, start, place)
+        return Progress(
+            state=State(start.q, start.v),
+            warm=first_warm(scheme, model, start, h, acceleration, multipliers),
+            place=place,
+            memory=plan.begin(model, timed),
+            result=_check_start(scheme, model, timed, h),
+            completed=jnp.array(0),
+            multipliers=multipliers,
+        )
+
+    def attempt(self, before: Progress, live: Flag) -> tuple[Progress, "_Attempt"]:
+        """Tries one step; where `live` is false nothing changes, and it costs nothing."""
+        model, plan = self.model, self.plan
+        place, length = plan.next(before.memory, before.place)
+        # A step that is not made has a length all the same: its derivatives are numbers.
+        length = jnp.where(live, length, plan.first())
+        begin = with_time(model, plan, before.state, before.place)
+        out = advance(
+            self.scheme,
+            model,
+            begin,
+            plan.unit * length,
+            plan.warm(before.memory, before.warm, length),
+            self.root_finder,
+            ~live,
+            self.max_halvings,
+        )
+        verdict = plan.judge(before.memory, model, begin, out, length)
+        good = live & verdict.accepted
+        result = RESULTS.where(live, verdict.result, RESULTS.successful)
+        keep = lambda new, old: _select(good, new, old)
+        after = Progress(
+            state=keep(State(out.state.q, out.state.v), before.state),
+            warm=keep(plan.kept(out.warm, before.warm), before.warm),
+            place=keep(place, before.place),
+            memory=_select(live, verdict.memory, before.memory),
+            result=first_failure(before.result, result),
+            completed=before.completed + good.astype(before.completed.dtype),
+            multipliers=keep(out.multipliers, before.multipliers),
+        )
+        zero_unless = lambda flag, x: jnp.where(flag, x, jnp.zeros_like(x))
+        return after, _Attempt(
+            energies=jax.tree.map(lambda x: zero_unless(good, x), out.energies),
+            details=out.details,
+            costs=Costs(
+                iterations=zero_unless(live, out.newton_iterations),
+                residual=zero_unless(live, out.residual),
+                halvings=zero_unless(live, out.halvings),
+                local_error=zero_unless(good, out.local_error),
+            ),
+            accepted=good,
+        )
+
+
+class _Attempt(eqx.Module):
+    """What is told of one step that was tried; energies are zero for a rejected one."""
+
+    energies: Energies
+    details: PyTree[Any]
+    costs: Costs
+    accepted: Flag
+
+
+def run_loop(
+    stepper: Stepper,
+    start: State,
+    steps_in_group: int,
+    keep: Callable[[State, Scalar], PyTree[Any]],
+) -> tuple[Begin, Progress, Record]:
+    """All steps of a run, in groups of so many attempts.
+
+    `keep(state, place)` is what is kept of the state after each group.
+    """
+    plan = stepper.plan
+    num_groups = -(-plan.max_attempts // steps_in_group)
+    is_whole = num_groups * steps_in_group == plan.max_attempts
+
+    def is_done(progress: Progress) -> Flag:
+        failed = progress.result != RESULTS.successful
+        done = failed | (progress.place >= plan.last)
+        return done if is_whole else done | (progress.completed >= plan.max_attempts)
+
+    over_groups, over_steps = loops(
+        num_groups, steps_in_group, None if plan.is_counted else is_done
+    )
+
+    def one_step(progress: Progress, live: Flag) -> tuple[Progress, _Attempt]:
+        return stepper.attempt(progress, live & ~is_done(progress))
+
+    def one_group(before: Progress, live: Flag) -> tuple[Progress, Record]:
+        lives = jnp.full((steps_in_group,), live)
+        after, attempts = over_steps(keep_roots(one_step), before, lives)
+        numbers = jnp.arange(steps_in_group)
+        last = jnp.max(jnp.where(attempts.accepted, numbers, 0))
+        return after, Record(
+            kept=keep(after.state, after.place),
+            multipliers=after.multipliers,
+            details=jax.tree.map(lambda x: x[last], attempts.details),
+            energies=jax.tree.map(jnp.sum, attempts.energies),
+            costs=attempts.costs.total(),
+            place=after.place,
+            reached=jnp.any(attempts.accepted) & (after.result == RESULTS.successful),
+        )
+
+    begin = stepper.begin(start)
+    kept = Begin(keep(begin.state, begin.place), begin.multipliers)
+    end, record = over_groups(one_group, begin, jnp.ones((num_groups,), bool))
+    arrived = RESULTS.where(
+        end.place >= plan.last, RESULTS.successful, RESULTS.out_of_steps
+    )
+    result = first_failure(end.result, arrived)
+    return kept, eqx.tree_at(lambda x: x.result, end, result), record
+
+
+def _select(good: Flag, new: PyTree[Any], old: PyTree[Any]) -> PyTree[Any]:
+    return jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)
+
+
+def _check_start(
+    scheme: AbstractScheme, model: AbstractModel, start: State, h: Scalar
+) -> RESULTS:
+    """Whether the start satisfies what the scheme holds, to half the digits of a step.
+
+    An error there would stay in the energy balance of the first step. The measure is
+    the motion or velocity that would repair it, against those of a step, wherever the
+    origin lies.
+    """
+    scales = model.scales
+    root = jnp.sqrt(model.energy_scale(start, h))
+    # NaN compares false: a start that cannot be measured fails at its first step.
+    tolerance = jnp.sqrt(jnp.finfo(h.dtype).eps)
+    position = jnp.abs(model.constraint(start.q, start.t))
+    rounding = 1e3 * jnp.finfo(h.dtype).eps * scales.constraint_size
+    far = position > 1e2 * tolerance * h * root * scales.constraint + rounding
+    bad = jnp.any(far)
+    if scheme.stage.formulation == "ggl":
+        rate = jnp.abs(model.joint_rate(start.q, start.v, start.t))
+        fast = rate > 1e2 * tolerance * root * scales.constraint[: rate.size]
+        bad = bad | jnp.any(fast)
+    return RESULTS.where(bad, RESULTS.inconsistent_start, RESULTS.successful)

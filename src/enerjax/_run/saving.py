@@ -1,0 +1,434 @@
+"""Which states of a run become the rows of its `Solution`."""
+
+import abc
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from .._operators import AbstractModel
+from .._programs import is_known
+from .._system import State
+from .._types import Args, Count, Multipliers, Scalar, Times, Vector
+from ..schemes import Energies
+from .dense_output import Bracket, state_within
+from .inputs import positive_integer
+from .step_sizes import AbstractController, AbstractPlan, EqualSteps
+
+
+SaveFunction: TypeAlias = Callable[[Scalar, State, Args], PyTree[Any]]
+
+
+class SaveAt(eqx.Module):
+    """Which states of a run are saved. Give at most one of `every`, `ts` and `t1`.
+
+    Without any of them a run of `num_steps` saves every step, and a run to a time its
+    start and its end.
+
+    **Arguments:**
+
+    - `every`: the start, every `every`-th step, and the end. Where the number of steps is
+      known only to be at most `max_steps`, there is room for that many, and rows that are
+      left over are NaN.
+    - `ts`: at these times, shape `(times,)`, ascending, from the start to the end of the
+      run. Within a step the state is interpolated to the order of the scheme and moved
+      onto the constraints; at its end it is the state itself. Memory grows with the number
+      of steps.
+    - `t1`: the start and the end.
+    - `fn`: a function `fn(t, state, args)`; what it returns, a pytree of arrays, is saved
+      as `Solution.ys` in place of the state. Of a long run of a large system it keeps
+      what is of interest alone.
+
+    **Raises:** `ValueError` or `TypeError` for more than one choice, for an `every` that is
+    no positive integer, and for an `fn` that is no function.
+    """
+
+    every: int | None = eqx.field(static=True, default=None)
+    ts: Vector | None = None
+    t1: bool = eqx.field(static=True, default=False)
+    fn: SaveFunction | None = None
+
+    def __check_init__(self):
+        given = [name for name in ("every", "ts") if getattr(self, name) is not None]
+        given += ["t1"] if self.t1 else []
+        if len(given) > 1:
+            raise ValueError(
+                "`SaveAt` takes one of `every`, `ts` and `t1`, got "
+                + " and ".join(f"`{name}`" for name in given)
+                + ". (The end of a run is always in the rows of `every`.)"
+            )
+        if self.every is not None:
+            positive_integer("every", self.every)
+        if not isinstance(self.t1, bool):
+            raise TypeError(
+                f"`SaveAt(t1=True)` saves the start and the end, got t1 = {self.t1!r}. "
+                "Times are given as `SaveAt(ts=...)`."
+            )
+        if self.fn is not None and not callable(self.fn):
+            raise TypeError(
+                f"`fn` must be a function of (t, state, args), got {self.fn!r}."
+            )
+
+
+def _as_times(ts: Vector, plan: AbstractPlan) -> Times:
+    """Requested times as an array, checked against the run."""
+    t0, t1, dtype = plan.t0, plan.t1, plan.t0.dtype
+    times = jnp.asarray(ts, dtype)
+    if times.ndim != 1 or times.size == 0:
+        raise ValueError(
+            f"`ts` must be a vector of times, shape (times,), got shape {times.shape}."
+        )
+    if is_known((t0, t1, ts)):
+        first, last = float(t0), float(t1)
+        room = 1e-6 * (last - first) if dtype == jnp.float32 else 1e-12 * (last - first)
+        values = np.asarray(ts, float)
+        inside = np.all((values >= first - room) & (values <= last + room))
+        if not inside or np.any(np.diff(values) < 0):
+            raise ValueError(
+                f"`ts` must be ascending times from t0 = {t0} to t1 = {t1}, got {ts}."
+            )
+    return times
+
+
+class Costs(eqx.Module):
+    """What steps cost; see `Statistics`."""
+
+    iterations: Array
+    residual: Array
+    halvings: Array
+    local_error: Array
+
+    def total(self) -> "Costs":
+        """Of all steps along the leading axis together."""
+        return Costs(
+            iterations=jnp.sum(self.iterations, axis=0),
+            residual=jnp.max(self.residual, axis=0),
+            halvings=jnp.max(self.halvings, axis=0),
+            local_error=jnp.sum(self.local_error, axis=0),
+        )
+
+    def by_segment(self, segment: Int[Array, " steps"], num_segments: int) -> "Costs":
+        """Of the steps of each segment together."""
+        add = lambda x: jax.ops.segment_sum(x, segment, num_segments)
+        largest = lambda x: jnp.maximum(jax.ops.segment_max(x, segment, num_segments), 0)
+        return Costs(
+            iterations=add(self.iterations),
+            residual=largest(self.residual),
+            halvings=largest(self.halvings),
+            local_error=add(self.local_error),
+        )
+
+
+class Record(eqx.Module):
+    """What the loop leaves, with a leading axis of groups of attempted steps.
+
+    - `kept`: of the state after the group, and `multipliers` of its last step.
+    - `details`: what the scheme reports of its own, of the last accepted step.
+    - `energies`, `costs`: of the group together; energies of accepted steps alone.
+    - `place`: of the run after the group, see `AbstractPlan`.
+    - `reached`: whether the group led on, and did not fail.
+    """
+
+    kept: PyTree[Any]
+    multipliers: Float[Array, "groups nc"]
+    details: PyTree[Any]
+    energies: Energies
+    costs: Costs
+    place: Float[Array, " groups"]
+    reached: Bool[Array, " groups"]
+
+
+class Begin(eqx.Module):
+    """The start of a run: what is kept of the state, and the multipliers there."""
+
+    kept: PyTree[Any]
+    multipliers: Multipliers
+
+
+class Rows(eqx.Module):
+    """The rows of a solution; `kept` are states, or what a function made of them."""
+
+    ts: Times
+    kept: PyTree[Any]
+    multipliers: Float[Array, "times nc"]
+    details: PyTree[Any]
+    energies: Energies
+    costs: Costs
+
+
+class AbstractSaving(eqx.Module):
+    """How rows are made: how many steps the loop takes between two states that it keeps,
+    and which rows follow from these."""
+
+    @abc.abstractmethod
+    def steps_in_group(self, plan: AbstractPlan) -> int:
+        """Attempted steps between two states that are kept."""
+
+    @property
+    @abc.abstractmethod
+    def keeps_rows(self) -> bool:
+        """Whether the states that the loop keeps are the rows."""
+
+    @abc.abstractmethod
+    def rows(
+        self,
+        model: AbstractModel,
+        plan: AbstractPlan,
+        begin: Begin,
+        record: Record,
+        completed: Count,
+        order: int,
+    ) -> Rows:
+        """The rows, NaN where the run did not come so far."""
+
+
+def saving_of(
+    saveat: SaveAt, plan: AbstractPlan, controller: AbstractController
+) -> AbstractSaving:
+    """How the rows of a run are made."""
+    if saveat.ts is not None:
+        return _AtTimes(_as_times(saveat.ts, plan))
+    if saveat.t1 or (saveat.every is None and not plan.is_counted):
+        return _AtBothEnds()
+    every = 1 if saveat.every is None else positive_integer("every", saveat.every)
+    if isinstance(controller, EqualSteps):
+        return _EveryEqualStep(min(every, plan.max_attempts))
+    return _EveryAcceptedStep(min(every, plan.max_attempts))
+
+
+class _AtBothEnds(AbstractSaving):
+    """Two rows."""
+
+    def steps_in_group(self, plan: AbstractPlan) -> int:
+        return plan.max_attempts
+
+    @property
+    def keeps_rows(self) -> bool:
+        return True
+
+    def rows(
+        self,
+        model: AbstractModel,
+        plan: AbstractPlan,
+        begin: Begin,
+        record: Record,
+        completed: Count,
+        order: int,
+    ) -> Rows:
+        at_end = record.reached & (record.place >= plan.last)
+        return _after_start(begin, record, at_end, jnp.stack([plan.t0, plan.t1]))
+
+
+class _EveryEqualStep(AbstractSaving):
+    """The start, every so many steps of one length, and the end."""
+
+    every: int = eqx.field(static=True)
+
+    def steps_in_group(self, plan: AbstractPlan) -> int:
+        return self.every
+
+    @property
+    def keeps_rows(self) -> bool:
+        return True
+
+    def rows(
+        self,
+        model: AbstractModel,
+        plan: AbstractPlan,
+        begin: Begin,
+        record: Record,
+        completed: Count,
+        order: int,
+    ) -> Rows:
+        # Of a run that fails the times are those that were planned.
+        numbers = self.every * jnp.arange(record.reached.size + 1, dtype=plan.last.dtype)
+        is_used = numbers - self.every < plan.last
+        ts = jnp.where(is_used, jax.vmap(plan.time)(numbers), jnp.nan)
+        return _after_start(begin, record, record.reached, ts)
+
+
+class _EveryAcceptedStep(AbstractSaving):
+    """The start, every so many accepted steps, and the end."""
+
+    every: int = eqx.field(static=True)
+
+    def steps_in_group(self, plan: AbstractPlan) -> int:
+        return 1
+
+    @property
+    def keeps_rows(self) -> bool:
+        return False
+
+    def rows(
+        self,
+        model: AbstractModel,
+        plan: AbstractPlan,
+        begin: Begin,
+        record: Record,
+        completed: Count,
+        order: int,
+    ) -> Rows:
+        num_rows = -(-record.reached.size // self.every)
+        accepted = _accepted(record)
+        last = jnp.minimum(self.every * jnp.arange(1, num_rows + 1), completed) - 1
+        is_used = self.every * jnp.arange(num_rows) < completed
+        picked = jax.tree.map(lambda x: x[last], accepted)
+        segment = jnp.minimum(_number_of_step(record) // self.every, num_rows - 1)
+        kept = eqx.tree_at(
+            lambda x: (x.energies, x.costs),
+            picked,
+            (
+                _energies_by_segment(record.energies, segment, num_rows),
+                record.costs.by_segment(segment, num_rows),
+            ),
+        )
+        times = jax.vmap(plan.time)(kept.place)
+        ts = jnp.append(plan.t0, jnp.where(is_used, times, jnp.nan))
+        return _after_start(begin, kept, is_used, ts)
+
+
+class _AtTimes(AbstractSaving):
+    """At requested times, which ascend. Those at the end of a step are its end.
+
+    The energies are those of the steps that have ended since the row before.
+    """
+
+    times: Times
+
+    def steps_in_group(self, plan: AbstractPlan) -> int:
+        return 1
+
+    @property
+    def keeps_rows(self) -> bool:
+        return False
+
+    def rows(
+        self,
+        model: AbstractModel,
+        plan: AbstractPlan,
+        begin: Begin,
+        record: Record,
+        completed: Count,
+        order: int,
+    ) -> Rows:
+        steps, ts, num = _accepted(record), self.times, self.times.size
+        ends = jnp.where(jnp.arange(record.reached.size) < completed, steps.place, jnp.inf)
+        places = (ts - plan.t0) / plan.unit
+        # The round-off of the times and of their differences.
+        size = plan.last + jnp.maximum(jnp.abs(plan.t0), jnp.abs(plan.t1)) / plan.unit
+        near = 16 * jnp.finfo(ts.dtype).eps * size
+        number = jnp.searchsorted(ends, places - near).astype(completed.dtype)
+        number = jnp.where(places >= -near, number, ends.size)
+        at_start = (number <= completed) & (jnp.abs(places) <= near)
+        inside = number < completed
+        number = jnp.where(inside, number, 0)
+        first = jnp.append(0.0, ends)[number]
+        last = jnp.where(inside, ends[number], plan.last)
+        at_end = jnp.abs(places - last) <= near
+        part = jnp.where(at_end, 1.0, (places - first) / (last - first))
+        part = jnp.where(at_start | ~inside, 0.0, part)
+        states = _states_within(
+            model, plan, begin, steps.kept, order, (number, first, last, part)
+        )
+        done = jnp.where(part == 1, number + 1, number)
+        segment = jnp.searchsorted(done, _number_of_step(record), side="right")
+        valid = inside | at_start
+        details = jax.tree.map(lambda x: x[number], steps.details)
+        multipliers = _nan_unless(valid, steps.multipliers[number])
+        energies = _energies_by_segment(record.energies, segment, num)
+        return Rows(
+            ts=ts,
+            kept=_nan_unless(valid, states),
+            multipliers=jnp.where(at_start[:, None], begin.multipliers[None], multipliers),
+            details=jax.tree.map(lambda x: x[1:], _nan_unless(valid, details)),
+            energies=_nan_unless(valid, energies),
+            costs=record.costs.by_segment(segment, num),
+        )
+
+
+def _states_within(
+    model: AbstractModel,
+    plan: AbstractPlan,
+    begin: Begin,
+    ends: State,
+    order: int,
+    rows: tuple[Count, Scalar, Scalar, Scalar],
+) -> State:
+    """States at parts of steps: the number of each step, its two places, and the part."""
+    starts = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), begin.kept, ends)
+
+    def state_at(row: tuple[Count, Scalar, Scalar, Scalar]) -> State:
+        number, first, last, part = row
+        pick = lambda tree: jax.tree.map(lambda x: x[number], tree)
+        a = pick(starts)
+        # A row that is not reached is no step: its derivatives are numbers all the same.
+        b = jax.tree.map(lambda x, y: jnp.where(part > 0, x, y), pick(ends), a)
+        bracket = Bracket(
+            start=with_time(model, plan, a, first),
+            end=with_time(model, plan, b, last),
+            h=plan.unit * (last - first),
+            part=part,
+        )
+        state = state_within(model, bracket, order)
+        return State(state.q, state.v)
+
+    return jax.lax.map(state_at, rows)
+
+
+def with_time(
+    model: AbstractModel, plan: AbstractPlan, state: State, place: Scalar
+) -> State:
+    """A state with its time, where time enters."""
+    t = plan.time(place) if model.system.is_timed else None
+    return State(state.q, state.v, t)
+
+
+def _accepted(record: Record) -> Record:
+    """The steps that were accepted, first; those behind them have no meaning."""
+    numbers = jnp.arange(record.reached.size)
+    order = jnp.searchsorted(jnp.cumsum(record.reached), numbers + 1)
+    order = jnp.minimum(order, numbers.size - 1)
+    return jax.tree.map(lambda x: x[order], record)
+
+
+def _number_of_step(record: Record) -> Int[Array, " groups"]:
+    """Which accepted step each attempt belongs to: a rejected one to the next accepted."""
+    reached = record.reached.astype(int)
+    return jnp.cumsum(reached) - reached
+
+
+def _energies_by_segment(
+    energies: Energies, segment: Int[Array, " steps"], num_segments: int
+) -> Energies:
+    return jax.tree.map(lambda x: jax.ops.segment_sum(x, segment, num_segments), energies)
+
+
+def _after_start(
+    begin: Begin, record: Record, valid: Bool[Array, " groups"], ts: Times
+) -> Rows:
+    """The start, and the groups behind it."""
+    kept, multipliers, details, energies = _nan_unless(
+        valid, (record.kept, record.multipliers, record.details, record.energies)
+    )
+    join = lambda x, y: jnp.concatenate([x[None], y])
+    return Rows(
+        ts=ts,
+        kept=jax.tree.map(join, begin.kept, kept),
+        multipliers=join(begin.multipliers, multipliers),
+        details=details,
+        energies=jax.tree.map(lambda x: jnp.append(jnp.zeros((), x.dtype), x), energies),
+        costs=record.costs,
+    )
+
+
+def _nan_unless(valid: Bool[Array, " rows"], tree: PyTree[Any]) -> PyTree[Any]:
+    def masked(x: Array) -> Array:
+        if not jnp.issubdtype(x.dtype, jnp.inexact):
+            return x
+        return jnp.where(valid.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan)
+
+    return jax.tree.map(masked, tree)
