@@ -16,9 +16,9 @@ from .helpers import EPS, problem
 H, STEPS = 1 / 64, 32
 
 
-def run(saveat, **options):
+def run(saveat, **given):
     system, start, args = problem("pendulum")
-    options: dict[str, Any] = options or dict(num_steps=STEPS)
+    options: dict[str, Any] = given or dict(num_steps=STEPS)
     return ej.simulate(
         system, ej.EnergyDecaying(0.5), start, args, h=H, saveat=saveat, **options
     )
