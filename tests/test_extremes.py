@@ -46,7 +46,7 @@ def test_motion_that_dies_out_away_from_zero_stays_at_rest():
 
 def test_slow_motion_beside_a_stiff_spring_is_right():
     rows, _ = verdicts(numbers.stiffness_rows(quick=True))
-    # The force of the stiffest is rounded by more than the others are; see the README.
+    # The force of the stiffest is rounded more than the others; see `docs/extremes.md`.
     lost = [row for row in rows if row.verdict != RIGHT]
     assert all(row.x == 1e14 and "Consistent" in row.scheme for row in lost)
     assert all(row.error <= 1e-3 for row in lost)

@@ -105,7 +105,6 @@ def _report(solution: Solution) -> str:
     iterations, halvings = (
         np.asarray(x) for x in (stats.newton_iterations, stats.halvings)
     )
-    made = np.sum(iterations)
     outcome, steps = tally(solution.result), f"{done}"
     if done.ndim == 0:
         outcome = outcome.removeprefix("1 ")
@@ -115,7 +114,7 @@ def _report(solution: Solution) -> str:
     rows = f"rows from t = {np.nanmin(times):.6g} to {np.nanmax(times):.6g}"
     lines = [outcome, f"{steps} steps, {rows}"]
     if np.sum(done) > 0:
-        lines.append(f"{made / np.sum(done):.1f} iterations a step")
+        lines.append(f"{np.sum(iterations) / np.sum(done):.1f} iterations a step")
     if np.any(halvings > 0):
         divided = f"steps divided before {np.sum(halvings > 0)} rows"
         lines.append(f"{divided}, into up to {2 ** halvings.max()} parts")
