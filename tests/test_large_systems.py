@@ -74,7 +74,7 @@ def test_the_pattern_covers_the_jacobian(name):
 
 def test_a_pattern_that_is_too_full_is_none(monkeypatch):
     """A system of such functions runs all the same, densely."""
-    monkeypatch.setattr("enerjax._programs.sparsity.dependence._TOO_MANY", 1000)
+    monkeypatch.setattr("enerjax._programs.sparsity.pattern._MAX_ENTRIES", 1000)
     size = 40
     mixed = lambda x: jnp.sin(jnp.cumsum(x))
     assert jacobian_pattern(mixed, jnp.ones(size)) is None

@@ -22,28 +22,22 @@
 import jax
 import jax.numpy as jnp
 
+from .._programs import primitives
 from . import arithmetic, choices, elementary, linalg, loops
 from .arithmetic import linear, rewritten, unary
 from .transform import Rule
 
 
-_STRUCTURAL = "concatenate stack pad complex conj".split()
-_ONE_OPERAND = (
-    "reshape broadcast_in_dim transpose squeeze expand_dims slice rev reduce_sum cumsum "
-    "copy real imag split reduce_precision sharding_constraint"
-).split()
-
 RULES: dict[str, Rule] = {
-    **dict.fromkeys([*_STRUCTURAL, *_ONE_OPERAND], linear()),
+    **{name: linear(*moved) for name, moved in primitives.DATA_MOVEMENT.items()},
+    **dict.fromkeys(primitives.COMPONENTS, linear()),
+    **dict.fromkeys(["cumsum", "reduce_sum", "sharding_constraint"], linear()),
+    "scatter-add": linear(0, 2),
     **dict.fromkeys("add sub neg add_any".split(), choices.sum_entries),
-    **dict.fromkeys(["gather", "dynamic_slice"], linear(0)),
     # The value moves whether it is differentiated or not.
     **dict.fromkeys(
         ["stop_gradient", "optimization_barrier"], lambda values, params: values
     ),
-    "dynamic_update_slice": linear(0, 1),
-    "scatter": linear(0, 2),
-    "scatter-add": linear(0, 2),
     "mul": arithmetic.product,
     "dot_general": arithmetic.product,
     "div": arithmetic.div,
@@ -74,15 +68,15 @@ RULES: dict[str, Rule] = {
     "erf": unary(elementary.smooth(jax.scipy.special.erf, 0.4)),
     "erfc": unary(elementary.smooth(jax.scipy.special.erfc, 0.4)),
     "abs": arithmetic.absolute,
-    **dict.fromkeys("sign floor ceil round".split(), choices.piecewise_constant),
+    **dict.fromkeys(primitives.PIECEWISE_CONSTANT, choices.piecewise_constant),
     "atan2": choices.atan2,
     "max": arithmetic.extreme(1),
     "min": arithmetic.extreme(-1),
     "reduce_max": arithmetic.reduce_extreme(jnp.maximum),
     "reduce_min": arithmetic.reduce_extreme(jnp.minimum),
-    **dict.fromkeys(["reduce_or", "reduce_and"], choices.reduce_logic),
+    **dict.fromkeys(primitives.LOGICAL_REDUCTIONS, choices.reduce_logic),
     "clamp": rewritten(lambda low, x, high: jnp.minimum(jnp.maximum(x, low), high)),
-    **dict.fromkeys("gt lt ge le eq ne is_finite and or xor not".split(), choices.compare),
+    **dict.fromkeys(primitives.COMPARISONS | primitives.LOGIC, choices.compare),
     "convert_element_type": choices.convert,
     "select_n": choices.select,
     "reduce_prod": arithmetic.reduce_prod,

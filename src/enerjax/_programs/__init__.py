@@ -1,17 +1,21 @@
-"""What is known of JAX programs: tracing, sparsity, rewriting, one machine function."""
+"""Programs of JAX: tracing, sparsity, rewriting, and compiling into one function."""
 
+from . import primitives as primitives
 from .fast_loops import enable_fast_loops as enable_fast_loops
 from .indices import Indices as Indices
-from .lanes import anywhere as anywhere
+from .lanes import in_any_lane as in_any_lane
 from .one_function.calls import in_one_function as in_one_function, unmerged as unmerged
 from .one_function.possible import LARGEST_SUM as LARGEST_SUM
-from .plain_products import plain_products as plain_products
+from .one_function.products import plain_products as plain_products
 from .sparsity.columns import (
     columns_along as columns_along,
     jacobian_columns as jacobian_columns,
 )
-from .sparsity.dependence import shape_of as shape_of
-from .sparsity.pattern import jacobian_pattern as jacobian_pattern, LARGE as LARGE
+from .sparsity.pattern import (
+    jacobian_pattern as jacobian_pattern,
+    LARGE as LARGE,
+    shape_of as shape_of,
+)
 from .tracing import (
     evaluate as evaluate,
     function_with_own_derivative as function_with_own_derivative,

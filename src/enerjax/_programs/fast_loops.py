@@ -7,24 +7,25 @@ import jax.numpy as jnp
 import jaxlib
 
 
-# Bytes that a loop may touch to be compiled into one function (1024 by default), which no
-# call of a library inside may interrupt.
+# A loop that touches no more bytes than this is compiled into one function, if it calls no
+# library inside (1024 by default).
 _FLAGS = ["--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=10000000"]
 if jaxlib.version.__version_info__ >= (0, 10, 2):
-    # Small reductions and products would become such calls. (Older versions know no such
-    # flag, and XLA ends the process at one that it does not know.)
+    # Without this flag small reductions and products would call a library. XLA ends the
+    # process at a flag that it does not know, as in older versions.
     _FLAGS.append("--xla_cpu_experimental_ynn_fusion_type=-dot,-reduce,-eltwise")
 
 
 def enable_fast_loops() -> None:
     """Let XLA compile a whole time loop into one function, on CPUs.
 
-    Runs of small systems and their derivatives are compiled so without it, where they can
-    be. Larger systems, and models with operations that a single function cannot have, can
-    be faster with it: measure yours. It is your decision, as it holds for all of JAX in the
-    process: it appends to the environment variable `XLA_FLAGS` and starts the CPU back end.
-    Call it right after the imports, before the first array is made (and after
-    `jax.distributed.initialize`, if you use it). Other processors are not affected.
+    Runs of small systems and their derivatives are compiled into one function without this
+    call, where that is possible. Larger systems, and models with operations that a single
+    function cannot have, can be faster with it: measure yours. The decision is yours,
+    because it holds for all of JAX in the process: the call appends to the environment
+    variable `XLA_FLAGS` and starts the CPU back end. Make it right after the imports,
+    before the first array is created (and after `jax.distributed.initialize`, if you use
+    it). Other processors are not affected.
 
     **Raises:** `RuntimeError` if the back end had started before, so that the setting came
     too late (or was not understood by this version of XLA).
@@ -44,7 +45,7 @@ def enable_fast_loops() -> None:
 
 
 def _are_fast() -> bool:
-    """Whether XLA compiles a loop in one piece that it would not by default."""
+    """Whether XLA compiles a loop into one function that is too large for its default."""
     cpu = jax.devices("cpu")[0]
     like = jax.ShapeDtypeStruct((4096,), jnp.float32)
     loop = lambda x: jax.lax.fori_loop(0, 9, lambda _, y: jnp.sin(y) + x, x)

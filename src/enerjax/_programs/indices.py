@@ -2,7 +2,7 @@ import numpy as np
 
 
 class Indices:
-    """Known indices, compared by value: systems that are made alike share programs."""
+    """Known indices, compared by value, so that equal systems share compiled programs."""
 
     def __init__(self, array: np.ndarray):
         self.array = array

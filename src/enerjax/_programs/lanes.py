@@ -1,4 +1,4 @@
-"""What the lanes of a batch decide together."""
+"""Decisions that all lanes of a batch take together."""
 
 import jax
 import jax.numpy as jnp
@@ -7,17 +7,17 @@ from .._types import Flag
 
 
 @jax.custom_batching.custom_vmap
-def anywhere(flag: Flag) -> Flag:
-    """Whether a flag holds in any lane of the `vmap`s around: the same for all of them.
+def in_any_lane(flag: Flag) -> Flag:
+    """Whether a flag holds in at least one lane of the `vmap`s around the call.
 
-    A branch that hangs on it stays a branch under `vmap`, where otherwise both of its
-    sides would run.
+    The answer is the same for all lanes. A `lax.cond` on it therefore stays a branch under
+    `vmap`, where a `lax.cond` on the flag itself would run both of its sides.
     """
     return flag
 
 
-@anywhere.def_vmap
-def _over_lanes(axis_size, in_batched, flags):
+@in_any_lane.def_vmap
+def _union_of_lanes(axis_size, in_batched, flags):
     del axis_size
     (is_batched,) = in_batched
-    return anywhere(jnp.any(flags, axis=0) if is_batched else flags), False
+    return in_any_lane(jnp.any(flags, axis=0) if is_batched else flags), False

@@ -1,4 +1,4 @@
-"""Traced values and programs: what JAX knows of a function before it runs."""
+"""Traced values and programs: what is known of a function before it runs."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+from .primitives import CALLS, JIT, WITH_OWN_DERIVATIVE
 
 
 def is_known(tree: Any) -> bool:
@@ -46,32 +48,21 @@ def evaluate(primitive: Any, values: list[Any], params: dict[str, Any]) -> list[
 
 
 def name_of(equation: Any) -> str:
-    """Under which name rules know it: that of its primitive, or `jit f`, where it calls a
-    function `f` of one array, which returns one, under `jax.jit`."""
+    """The name under which tables of rules list an equation.
+
+    It is the name of the primitive. For a call, under `jax.jit`, of a function `f` from one
+    array to one array it is `jit f`.
+    """
     name = equation.primitive.name
-    # (A derivative of what has a name keeps it, and has more inputs or outputs.)
-    if name in _JIT and len(equation.invars) == len(equation.outvars) == 1:
+    # The derivative of a named function keeps the name, but has more inputs or outputs.
+    if name in JIT and len(equation.invars) == len(equation.outvars) == 1:
         return f"jit {equation.params['name']}"
     return name
 
 
-_JIT = ("jit", "pjit")
-# Primitives that only wrap a program, and the parameter that holds it.
-_WRAPPERS = {
-    "jit": "jaxpr",
-    "pjit": "jaxpr",
-    "closed_call": "call_jaxpr",
-    "core_call": "call_jaxpr",
-    "custom_jvp_call": "call_jaxpr",
-    "custom_vjp_call": "call_jaxpr",
-    "checkpoint": "jaxpr",
-    "remat2": "jaxpr",
-}
-
-
 def wrapped_program(equation: Any) -> tuple[Jaxpr, list[Any]] | None:
-    """The program, and its constants, where an equation only wraps one."""
-    name = _WRAPPERS.get(equation.primitive.name)
+    """The program and its constants, if an equation only wraps a program."""
+    name = CALLS.get(equation.primitive.name)
     if name is None:
         return None
     program = equation.params[name]
@@ -81,9 +72,11 @@ def wrapped_program(equation: Any) -> tuple[Jaxpr, list[Any]] | None:
 
 
 def function_with_own_derivative(equation: Any) -> tuple[str, bool] | None:
-    """The name of a function whose derivative is given, and whether JAX or this library
-    defines it, where an equation calls one: under `jax.custom_jvp` or `jax.custom_vjp`."""
-    if equation.primitive.name not in ("custom_jvp_call", "custom_vjp_call"):
+    """The function under `jax.custom_jvp` or `jax.custom_vjp` that an equation calls.
+
+    Returned are its name, and whether JAX or this library defines it; `None` for others.
+    """
+    if equation.primitive.name not in WITH_OWN_DERIVATIVE:
         return None
     program, _ = wrapped_program(equation) or (None, [])
     info = getattr(program, "debug_info", None)
@@ -93,12 +86,13 @@ def function_with_own_derivative(equation: Any) -> tuple[str, bool] | None:
     )
 
 
-# Where a derivative that is given is that of the program inside, only better computed.
+# Functions that are defined in these folders have the derivative of the program inside,
+# computed in a better way.
 _TRUSTED = Path(jax.__file__).parent, Path(__file__).parents[1]
 
 
 def programs_within(equation: Any) -> Iterator[Jaxpr]:
-    """All programs among the parameters of an equation: bodies, branches, what it wraps."""
+    """All programs among the parameters of an equation: bodies, branches, wrapped ones."""
     yield from _programs(equation.params.values())
 
 

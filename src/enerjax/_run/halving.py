@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from .._operators import AbstractModel
-from .._programs import anywhere
+from .._programs import in_any_lane
 from .._results import RESULTS
 from .._solvers import RootFinder
 from .._system import State
@@ -56,7 +56,7 @@ def solve_or_divide(
             new = _in_parts(scheme, model, start, h, root_finder, before, parts, most)
             return _select(failed, (new, times), carry)
 
-        return jax.lax.cond(anywhere(failed), again, lambda: carry), None
+        return jax.lax.cond(in_any_lane(failed), again, lambda: carry), None
 
     def divided():
         return jax.lax.scan(halve, (whole, none), jnp.arange(1, max_halvings + 1))[0]
@@ -66,7 +66,7 @@ def solve_or_divide(
     failed = (whole.result != RESULTS.successful) & ~skip
     # Lanes that take their steps together share the program: it runs if one needs it.
     return jax.lax.cond(
-        anywhere(failed), jax.checkpoint(divided, policy=forget), lambda: (whole, none)
+        in_any_lane(failed), jax.checkpoint(divided, policy=forget), lambda: (whole, none)
     )
 
 

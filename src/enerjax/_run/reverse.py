@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from .._programs import anywhere, in_one_function
+from .._programs import in_any_lane, in_one_function
 from .._solvers import ROOT
 
 
@@ -86,5 +86,5 @@ def _unless(done: Callable[[Any], Array], segment: Body) -> Body:
         _, out = jax.eval_shape(segment, carry, live)
         return carry, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), out)
 
-    skip = lambda carry: ~anywhere(~done(carry))
+    skip = lambda carry: ~in_any_lane(~done(carry))
     return lambda carry, live: jax.lax.cond(skip(carry), idle, segment, carry, live)

@@ -116,8 +116,8 @@ def _report(solution: Solution) -> str:
     if np.sum(done) > 0:
         lines.append(f"{np.sum(iterations) / np.sum(done):.1f} iterations a step")
     if np.any(halvings > 0):
-        divided = f"steps divided before {np.sum(halvings > 0)} rows"
-        lines.append(f"{divided}, into up to {2 ** halvings.max()} parts")
+        rows = f"before {np.sum(halvings > 0)} of {halvings.size} rows"
+        lines.append(f"steps divided, into up to {2 ** halvings.max()} parts, {rows}")
     if stats.rejected_steps is not None:
         lines.append(f"{np.sum(stats.rejected_steps)} steps repeated with another length")
     phase = np.nanmax(np.asarray(solution.phase_error), initial=0.0)

@@ -1,4 +1,8 @@
-"""The iterations of Newton's method, for arguments and values scaled to order one."""
+"""The iterations of Newton's method, for arguments and values scaled to order one.
+
+An iteration proposes a correction, classifies it by the sizes of this correction and of the
+one before, and takes it, halves the one before, or asks for a new Jacobian.
+"""
 
 from typing import NamedTuple
 
@@ -15,57 +19,107 @@ from .linear.norms import largest
 from .newton import Newton, Start
 
 
+# Thresholds of the method -----------------------------------------------------------------
+
+# Jacobians after which the first guess is given up. Searches that reach quadratic
+# convergence reach it earlier.
+PATIENCE = 12
+# Jacobians of an attempt without damping. For a double pendulum with a 200 times lighter
+# inner mass, at h = 0.01, the steps that need such an attempt and find a root with up to 20
+# Jacobians follow the branch of the motion. Those that take longer mostly do not.
+_UNDAMPED_PATIENCE = 20
+# A Jacobian serves on while corrections shrink at least by this factor. A weaker correction
+# is not made, although the approximate inverse might improve it: that inverse cannot see
+# directions that have become soft since, and a light body stays unresolved behind a heavy
+# one until corrections are exact.
+_SHRINKS = 0.3
+# This many stalled corrections in a row end a search far from the origin.
+_STALLS = 4
+# The smallest part of a correction that damping tries.
+_LEAST_PART = 0.01
+
+
+class _Powers(NamedTuple):
+    """Thresholds that depend on the precision: powers of the machine epsilon.
+
+    - `floor`: the least size, as a part of the largest unknown, by which an unknown is
+      measured.
+    - `small`: a correction, or a residual, below this is in the range of convergence.
+    - `moderate`: a residual above this is no round-off, wherever the coordinates are.
+    - `tiny`: a residual below this is round-off if a new Jacobian does not improve it.
+    - `round_off`: a residual below this is round-off if the same Jacobian, which did
+      improve it, no longer does.
+    """
+
+    eps: float
+    floor: float
+    small: float
+    moderate: float
+    tiny: float
+    round_off: float
+
+
+def _powers(dtype: jnp.dtype) -> _Powers:
+    eps = float(jnp.finfo(dtype).eps)
+    return _Powers(
+        eps=eps,
+        floor=eps**0.125,
+        small=eps**0.25,
+        moderate=eps**0.5,
+        tiny=eps**0.75,
+        round_off=eps**0.875,
+    )
+
+
+# The search -------------------------------------------------------------------------------
+
+
 def max_norm(x: PyTree[Array]) -> Scalar:
-    """The largest entry; for all residuals and corrections here are of order one."""
+    """The largest entry; for residuals and corrections, which are all scaled."""
     return largest(ravel_pytree(x)[0])
 
 
 class _Iterate(eqx.Module):
+    """The state of a search.
+
+    - `x`: the unknowns.
+    - `factors`: of the Jacobian in use.
+    - `step`, `part`: the last correction that was computed with a new Jacobian, and the
+      part of it that was taken.
+    - `size`: of the last correction, relative to the unknowns; infinite before the first.
+    - `contraction`: `size` divided by that of the correction before, if both were computed
+      with the same Jacobian, else zero.
+    - `corrections`, `jacobians`: how many have been computed.
+    - `stalls`: new Jacobians in a row whose correction was small and did not shrink.
+    - `defect`: the largest residual at the iterate that was corrected last.
+    - `fresh`: whether the factors are of the Jacobian at `x`.
+    - `stale`: whether the Jacobian is to be renewed.
+    - `done`, `broken`: whether the search has converged, or has become non-finite.
+    """
+
     x: Float[Array, " n"]
     factors: AbstractFactors
-    # The last correction made with a Jacobian of its own, and the part of it that was.
     step: Float[Array, " n"]
     part: Scalar
-    # Size of the last correction, infinite if there was none, and what it had left of the
-    # one before, zero unless both were made with the same Jacobian.
     size: Scalar
     contraction: Scalar
     corrections: Count
     jacobians: Count
-    # Jacobians in a row after which the correction was small and did not shrink.
     stalls: Count
-    # Size of the residual that the last correction was made from.
     defect: Scalar
-    # Whether the factors are of the Jacobian at `x`, and whether they should become so.
     fresh: Flag
     stale: Flag
     done: Flag
     broken: Flag
 
 
-# Jacobians after which the first guess is given up. Where quadratic convergence sets in at
-# all, it does so before.
-PATIENCE = 12
-# Without damping. Of the steps of a double pendulum with an inner mass 200 times lighter,
-# at h = 0.01, that are found only so, those found with 20 Jacobians are on the branch of
-# the motion, and those that take longer are mostly not.
-_UNDAMPED_PATIENCE = 20
-# What a correction may leave of the one before, for its Jacobian to serve on. What steps
-# before have left is never used as it is, near as it can be: it is blind to what has become
-# soft since, and a light body hides behind a heavy one until corrections are exact.
-_SHRINKS = 0.3
-_STALLS = 4
-# A correction is halved until it takes no part smaller than this.
-_LEAST_PART = 0.01
-
-
 def newton_iterations(
     residual: Linearisable, newton: Newton, start: Start, max_jacobians: int
 ) -> _Iterate:
-    """A search; `max_jacobians` are those of the attempts with damping, in all."""
+    """A search; `max_jacobians` bounds the two attempts with damping together."""
     guesses = jnp.stack([ravel_pytree(x)[0] for x in (start.guess, *start.others)])
     factors = residual.first_factors(start.factors, guesses[0])
-    first = _first(factors, guesses[0], jnp.array(0), start.skip)
+    first = _first_iterate(factors, guesses[0], jnp.array(0), start.skip)
     num_attempts = guesses.shape[0]
     if num_attempts == 1:
         return _attempt(residual, newton, start, first, max_jacobians, True)
@@ -73,35 +127,34 @@ def newton_iterations(
 
     def attempt(carry: tuple[Count, _Iterate]) -> tuple[Count, _Iterate]:
         k, last = carry
-        begun = _first(last.factors, guesses[k], last.corrections, start.skip)
+        begin = _first_iterate(last.factors, guesses[k], last.corrections, start.skip)
         limit = jnp.asarray(limits[:num_attempts])[k]
-        return k + 1, _attempt(residual, newton, start, begun, limit, k < 2)
+        return k + 1, _attempt(residual, newton, start, begin, limit, k < 2)
 
     unfinished = lambda carry: ~carry[1].done & (carry[0] < num_attempts)
     return jax.lax.while_loop(unfinished, attempt, (jnp.array(0), first))[1]
 
 
-def _first(
+def _first_iterate(
     factors: AbstractFactors, x: Float[Array, " n"], corrections: Count, done: Flag
 ) -> _Iterate:
-    """Where an attempt begins."""
     zero, one, infinite = (jnp.asarray(value, x.dtype) for value in (0.0, 1.0, jnp.inf))
     none, no, yes = jnp.array(0), jnp.array(False), jnp.array(True)
     return _Iterate(
-        x,
-        factors,
-        jnp.zeros_like(x),
-        one,
-        infinite,
-        zero,
-        corrections,
-        none,
-        none,
-        zero,
-        no,
-        yes,
-        done,
-        no,
+        x=x,
+        factors=factors,
+        step=jnp.zeros_like(x),
+        part=one,
+        size=infinite,
+        contraction=zero,
+        corrections=corrections,
+        jacobians=none,
+        stalls=none,
+        defect=zero,
+        fresh=no,
+        stale=yes,
+        done=done,
+        broken=no,
     )
 
 
@@ -114,96 +167,136 @@ def _attempt(
     damped: Flag | bool,
 ) -> _Iterate:
     """A search from one guess."""
-    eps = float(jnp.finfo(first.x.dtype).eps)
+    powers = _powers(first.x.dtype)
 
-    def linearise(carry: _Iterate) -> _Iterate:
-        factors = carry.factors.renewed(residual.jacobian(carry.x))
+    def linearise(iterate: _Iterate) -> _Iterate:
+        factors = iterate.factors.renewed(residual.jacobian(iterate.x))
         return eqx.tree_at(
             lambda c: (c.factors, c.jacobians, c.fresh, c.stale),
-            carry,
-            (factors, carry.jacobians + 1, jnp.array(True), jnp.array(False)),
+            iterate,
+            (factors, iterate.jacobians + 1, jnp.array(True), jnp.array(False)),
         )
 
-    def correct(before: _Iterate) -> _Iterate:
-        before = jax.lax.while_loop(lambda c: c.stale, linearise, before)
-        fresh = before.fresh
-        value = residual.value(before.x)
-        correction = before.factors.solve(value)
-        x = before.x - correction
-        # Each unknown against itself: one scale for all would hide a light, slow body
-        # beside a heavy, fast one. The floor is for unknowns that pass through zero; where
-        # all of them are small, they had been taken for larger than they are.
-        floor = eps**0.125 * jnp.clip(largest(x), start.least, 1.0)
-        size = largest(correction / (jnp.abs(x) + floor))
-        defect, contraction = max_norm(value), size / before.size
-        shrinks = contraction < _SHRINKS
-        new = _Size(size, contraction, defect, shrinks)
-        is_root, ends, stalls = _ends(before, new, newton, residual.is_exact, eps)
-        done = (is_root | ends) & jnp.isfinite(size)
-        kept = fresh | shrinks | is_root
-        # The first correction after one with a Jacobian of its own is what that has left
-        # over: it went too far where that is more than there was, and more than round-off.
-        second = ~fresh & (before.contraction == 0) & (before.size > eps**0.25)
-        less = contraction <= 1 - 0.25 * before.part
-        back = damped & second & ~less & ~done & (before.part > _LEAST_PART)
-        part = jnp.where(back, 0.5 * before.part, jnp.ones_like(before.part))
-        broken = fresh & ~jnp.isfinite(size)
-        stays = jnp.where(back, before.x + part * before.step, before.x)
-        return _Iterate(
-            jnp.where(kept, x, stays),
-            before.factors,
-            jnp.where(fresh, correction, before.step),
-            part,
-            jnp.where(kept, size, before.size),
-            jnp.where(fresh | back, 0, contraction),
-            before.corrections + (kept | back).astype(before.corrections.dtype),
-            before.jacobians,
-            stalls,
-            defect,
-            jnp.zeros_like(fresh),
-            ~kept & ~back,
-            done,
-            broken,
-        )
+    def iteration(iterate: _Iterate) -> _Iterate:
+        iterate = jax.lax.while_loop(lambda c: c.stale, linearise, iterate)
+        correction = _propose(residual, iterate, start.least, powers)
+        verdict = _classify(iterate, correction, newton, residual.is_exact, powers)
+        return _next_iterate(iterate, correction, verdict, damped, powers)
 
     unfinished = lambda c: (
         ~(c.done | c.broken) & ~(c.stale & (c.jacobians >= max_jacobians))
     )
-    return jax.lax.while_loop(unfinished, correct, first)
+    return jax.lax.while_loop(unfinished, iteration, first)
 
 
-class _Size(NamedTuple):
-    """The size of a correction, in parts of the one before too, and of its residual."""
+# One iteration ----------------------------------------------------------------------------
 
+
+class _Correction(NamedTuple):
+    """A correction, the unknowns that it leads to, and its size, relative to these.
+
+    `contraction` compares the size with that of the correction before; `shrinks` says
+    whether that is enough. `defect` is the largest residual that is corrected.
+    """
+
+    step: Float[Array, " n"]
+    x: Float[Array, " n"]
     size: Scalar
     contraction: Scalar
-    defect: Scalar
     shrinks: Flag
+    defect: Scalar
 
 
-def _ends(
-    before: _Iterate, new: _Size, newton: Newton, is_exact: bool, eps: float
-) -> tuple[Flag, Flag, Count]:
-    """Whether the residual is round-off, whether a correction ends the search for another
-    reason, and how many in a row have stalled."""
-    size, contraction, defect, shrinks = new
-    fresh, small = before.fresh, size <= eps**0.25
-    # The contraction of a chord is what its Jacobian is off by: it stays. At least as
-    # much as the last correction moved it, and as it was: where one shrinks more, it
-    # is an accident.
-    rate = jnp.maximum(jnp.maximum(contraction, before.contraction), before.size)
-    converged = (size * rate <= newton.rtol * eps) & (defect <= eps**0.25)
-    converged = ~fresh & shrinks & converged
-    is_root = (defect <= newton.atol * eps) & small
-    # One that shrank, with this Jacobian, and no longer does has met the round-off.
-    met = ~fresh & ~shrinks & (before.contraction > 0)
-    met = met & (defect <= eps**0.875) & small
-    # So has one with a Jacobian of its own; but where the residual is not tiny
-    # (coordinates a million lengths off) only if it happens again and again, and never
-    # where it is not small: a residual can have a smallest value that is no root. With
-    # one that is not exact corrections can shrink slowly, and go on.
+class _Verdict(NamedTuple):
+    """Whether the residual is round-off, whether the search ends, and stalls in a row."""
+
+    is_root: Flag
+    done: Flag
+    stalls: Count
+
+
+def _propose(
+    residual: Linearisable, iterate: _Iterate, least: Scalar, powers: _Powers
+) -> _Correction:
+    value = residual.value(iterate.x)
+    step = iterate.factors.solve(value)
+    x = iterate.x - step
+    # Every unknown is compared with itself: one scale for all would hide a light, slow
+    # body beside a heavy, fast one. The floor is for unknowns that pass through zero. It
+    # follows the largest unknown, down to `least`, for where all unknowns are far smaller
+    # than their scales.
+    floor = powers.floor * jnp.clip(largest(x), least, 1.0)
+    size = largest(step / (jnp.abs(x) + floor))
+    contraction = size / iterate.size
+    shrinks = contraction < _SHRINKS
+    return _Correction(step, x, size, contraction, shrinks, max_norm(value))
+
+
+def _classify(
+    iterate: _Iterate,
+    correction: _Correction,
+    newton: Newton,
+    is_exact: bool,
+    powers: _Powers,
+) -> _Verdict:
+    _, _, size, contraction, shrinks, defect = correction
+    fresh, small = iterate.fresh, size <= powers.small
+    # The contraction of a chord iteration measures the error of its Jacobian, and stays
+    # what it is. A better one is an accident, so the bound on the next correction uses at
+    # least the contraction of the correction before, and at least that correction itself,
+    # by whose size the Jacobian has changed.
+    rate = jnp.maximum(jnp.maximum(contraction, iterate.contraction), iterate.size)
+    converged = size * rate <= newton.rtol * powers.eps
+    converged = ~fresh & shrinks & converged & (defect <= powers.small)
+    is_root = (defect <= newton.atol * powers.eps) & small
+    # Corrections with one Jacobian that did shrink, and no longer do, have met round-off.
+    met = ~fresh & ~shrinks & (iterate.contraction > 0)
+    met = met & (defect <= powers.round_off) & small
+    # So has a correction with a new Jacobian that does not shrink. Where the residual is
+    # not tiny (coordinates a million lengths from the origin) this must happen several
+    # times in a row, and the residual must not be large: a residual can have a smallest
+    # value that is no root. Corrections with an inexact Jacobian may shrink slowly without
+    # having met round-off.
     stalled = fresh & small & (~shrinks if is_exact else contraction >= 1)
-    stalls = jnp.where(fresh, jnp.where(stalled, before.stalls + 1, 0), before.stalls)
-    again_and_again = (stalls == _STALLS) & (defect <= eps**0.5) & is_exact
-    met = met | (stalled & ((defect <= eps**0.75) | again_and_again))
-    return is_root, converged | met, stalls
+    stalls = jnp.where(fresh, jnp.where(stalled, iterate.stalls + 1, 0), iterate.stalls)
+    repeatedly = (stalls == _STALLS) & (defect <= powers.moderate) & is_exact
+    met = met | (stalled & ((defect <= powers.tiny) | repeatedly))
+    done = (is_root | converged | met) & jnp.isfinite(size)
+    return _Verdict(is_root, done, stalls)
+
+
+def _next_iterate(
+    iterate: _Iterate,
+    correction: _Correction,
+    verdict: _Verdict,
+    damped: Flag | bool,
+    powers: _Powers,
+) -> _Iterate:
+    """Takes the correction, or halves the one before, or asks for a new Jacobian."""
+    fresh, part = iterate.fresh, iterate.part
+    taken = fresh | correction.shrinks | verdict.is_root
+    # The first correction after one with a new Jacobian measures how far that went wrong.
+    # If it is larger than it would be after a good one, and than round-off, the one before
+    # is halved (P. Deuflhard's natural monotonicity test).
+    is_second = ~fresh & (iterate.contraction == 0) & (iterate.size > powers.small)
+    is_monotone = correction.contraction <= 1 - 0.25 * part
+    halves = damped & is_second & ~is_monotone & ~verdict.done & (part > _LEAST_PART)
+    part = jnp.where(halves, 0.5 * part, jnp.ones_like(part))
+    x_otherwise = jnp.where(halves, iterate.x + part * iterate.step, iterate.x)
+    changes = (taken | halves).astype(iterate.corrections.dtype)
+    return _Iterate(
+        x=jnp.where(taken, correction.x, x_otherwise),
+        factors=iterate.factors,
+        step=jnp.where(fresh, correction.step, iterate.step),
+        part=part,
+        size=jnp.where(taken, correction.size, iterate.size),
+        contraction=jnp.where(fresh | halves, 0, correction.contraction),
+        corrections=iterate.corrections + changes,
+        jacobians=iterate.jacobians,
+        stalls=verdict.stalls,
+        defect=correction.defect,
+        fresh=jnp.zeros_like(fresh),
+        stale=~taken & ~halves,
+        done=verdict.done,
+        broken=fresh & ~jnp.isfinite(correction.size),
+    )

@@ -27,39 +27,40 @@ def call(fn: Callable[..., PyTree[Array]], *args: PyTree[Array]) -> PyTree[Array
 class _Program:
     """A program as the parameter of a primitive.
 
-    - `jaxpr`: its constants come first among the inputs, for they can be traced, and would
-      outlive their trace.
-    - `known`: the values of inputs that are indices and known, else `None`.
-    - `linear`: of how many of the last inputs it is a linear function.
+    - `jaxpr`: its constants are passed as the first inputs. They can be traced, and a
+      program that held them would outlive their trace.
+    - `known`: the values of those inputs that are known indices; `None` for the others.
+    - `linear`: the number of inputs, the last ones, that the program is linear in.
     """
 
     def __init__(self, jaxpr: Any, known: Sequence[np.ndarray | None], linear: int):
         self.jaxpr = jaxpr
         self.known = known
         self.linear = linear
-        # What is run instead (derivatives are of the program itself), what it takes first,
-        # and which of the inputs it does not take.
-        self._words, self._consts, self._fixed = None, [], [None] * len(known)
+        # The program that is run, which is rewritten if need be (derivatives are taken of
+        # `jaxpr`), the constants that it takes first, and the inputs that it does not take.
+        self._executed, self._consts, self._fixed = None, [], [None] * len(known)
         if is_possible(jaxpr):
-            self._words = jaxpr
-        elif is_possible(jaxpr, besides=REWRITTEN):
-            words = rewritten(jaxpr, known)
-            if is_possible(words.jaxpr):
-                self._words, self._consts, self._fixed = words.jaxpr, words.consts, known
-        # What is evaluated by itself is compiled once.
+            self._executed = jaxpr
+        elif is_possible(jaxpr, assumed=REWRITTEN):
+            rewritten_program = rewritten(jaxpr, known)
+            if is_possible(rewritten_program.jaxpr):
+                self._executed = rewritten_program.jaxpr
+                self._consts, self._fixed = rewritten_program.consts, known
+        # Evaluations outside of other programs share one compilation.
         self.compiled = jax.jit(lambda *numbers: self.run(numbers))
 
     @property
     def is_possible(self) -> bool:
-        """Whether it can be one function."""
-        return self._words is not None and any(x is None for x in self._fixed)
+        """Whether the program can be one function."""
+        return self._executed is not None and any(x is None for x in self._fixed)
 
     def run(self, numbers: Sequence[Array]) -> list[Array]:
-        """What it returns, from one function."""
+        """The outputs, computed in one function."""
         pairs = zip(numbers, self._fixed, strict=True)
-        left = (x for x, fixed in pairs if fixed is None)
-        inputs = [*map(jnp.asarray, self._consts), *left]
-        return marked(functools.partial(_values, self._words), inputs)
+        taken = (x for x, fixed in pairs if fixed is None)
+        inputs = [*map(jnp.asarray, self._consts), *taken]
+        return marked(functools.partial(_values, self._executed), inputs)
 
     def __call__(self, numbers: Sequence[Array]) -> list[Array]:
         pairs = zip(numbers, self.known, strict=True)
@@ -67,7 +68,7 @@ class _Program:
 
 
 def _values(jaxpr: Any, numbers: Sequence[Any]) -> list[Array]:
-    """What a program returns, whose constants come first among the numbers."""
+    """The outputs of a program whose constants are the first of the numbers."""
     count = len(jaxpr.constvars)
     return jaxpr_as_fun(ClosedJaxpr(jaxpr, list(numbers[:count])))(*numbers[count:])
 
@@ -75,28 +76,28 @@ def _values(jaxpr: Any, numbers: Sequence[Any]) -> list[Array]:
 def _run(
     closed: ClosedJaxpr, inputs: Sequence[Any], wanted: Sequence[bool], linear: int = 0
 ) -> list[Any]:
-    """The outputs of a program that are wanted, in one function where that is possible.
+    """The wanted outputs of a program, in one function where that is possible.
 
-    And `None` for the others. Inputs that are handed through are not copied.
+    The others are `None`. An input that is an output too is returned without a copy.
     """
     numbers = [*closed.consts, *inputs]
     variables = (*closed.jaxpr.constvars, *closed.jaxpr.invars)
-    given = {id(x): number for x, number in zip(variables, numbers, strict=True)}
-    through = [id(x) in given for x in closed.jaxpr.outvars]
-    made = [on and not same for on, same in zip(wanted, through, strict=True)]
-    jaxpr, of_consts, of_inputs = dce_jaxpr_consts(closed.jaxpr, made)
+    inputs_by_id = {id(x): number for x, number in zip(variables, numbers, strict=True)}
+    handed_through = [id(x) in inputs_by_id for x in closed.jaxpr.outvars]
+    computed = [on and not same for on, same in zip(wanted, handed_through, strict=True)]
+    jaxpr, of_consts, of_inputs = dce_jaxpr_consts(closed.jaxpr, computed)
     needed, _ = _split([*of_consts, *of_inputs], numbers)
     linear = sum(of_inputs[len(of_inputs) - linear :])
     program = _Program(jaxpr, list(map(as_index, needed)), linear)
     needed = list(map(jnp.asarray, needed))
-    if any(made) and program.is_possible:
+    if any(computed) and program.is_possible:
         out = ONE_FUNCTION.bind(*needed, program=program)
     else:
         out = program(needed)
-    _, variables = _split(made, closed.jaxpr.outvars)
-    _, asked = _split(made, wanted)
+    _, variables = _split(computed, closed.jaxpr.outvars)
+    _, asked = _split(computed, wanted)
     pairs = zip(variables, asked, strict=True)
-    return _merged(made, out, [given[id(x)] if on else None for x, on in pairs])
+    return _merged(computed, out, [inputs_by_id[id(x)] if on else None for x, on in pairs])
 
 
 ONE_FUNCTION = Primitive(NAME)
@@ -105,7 +106,7 @@ ONE_FUNCTION.multiple_results = True
 
 @ONE_FUNCTION.def_impl
 def _evaluated(*numbers: Array, program: _Program) -> list[Array]:
-    # (A new `jit` of this primitive would come back here where JAX looks for NaNs.)
+    # With `jax_disable_jit`, as in the search for NaNs, another `jit` would come back here.
     is_apart = jax.config.jax_disable_jit  # pyright: ignore[reportAttributeAccessIssue]
     return program(numbers) if is_apart else program.compiled(*numbers)
 
@@ -116,21 +117,21 @@ def _shapes(*_: Any, program: _Program) -> list[Any]:
 
 
 def _jvp(primals: Any, tangents: Any, *, program: _Program) -> tuple[list, list]:
-    """The values with what their rates need in one function, and the rates in another."""
-    moves = [not isinstance(t, ad.Zero) for t in tangents]
-    moved, _ = _split(moves, tangents)
+    """Values in one function, with the residuals of the linearisation; rates in another."""
+    has_tangent = [not isinstance(t, ad.Zero) for t in tangents]
+    moved, _ = _split(has_tangent, tangents)
     smooth = [jnp.issubdtype(x.aval.dtype, jnp.inexact) for x in program.jaxpr.outvars]
 
     def linearised(*numbers):
-        own, still = _split(moves, numbers)
-        values = lambda *own: _split(smooth, program(_merged(moves, own, still)))
+        own, still = _split(has_tangent, numbers)
+        values = lambda *own: _split(smooth, program(_merged(has_tangent, own, still)))
         return jax.linearize(values, *own, has_aux=True)
 
     closed, like = jax.make_jaxpr(linearised, return_shape=True)(*primals)
     pushed = jax.make_jaxpr(lambda push, moved: push(*moved))(like[1], moved)
     depends = _depends(pushed, len(moved))
     _, _, uses = dce_jaxpr_consts(pushed.jaxpr, depends)
-    # Of the values, what the rates need of them, and the values without rates.
+    # The outputs of `closed`: values, residuals that the rates need, values without rates.
     num_values, num_others = sum(smooth), len(smooth) - sum(smooth)
     num_kept = len(closed.out_avals) - len(smooth)
     wanted = [True] * num_values + uses[:num_kept] + [True] * num_others
@@ -144,7 +145,7 @@ def _jvp(primals: Any, tangents: Any, *, program: _Program) -> tuple[list, list]
 
 
 def _depends(closed: ClosedJaxpr, linear: int) -> list[bool]:
-    """Which outputs of a program depend on the last of its inputs."""
+    """Which outputs of a program depend on its last `linear` inputs."""
     jaxpr: Any = closed.jaxpr
     on = {id(x) for x in jaxpr.invars[len(jaxpr.invars) - linear :]}
     for eqn in jaxpr.eqns:
@@ -156,11 +157,11 @@ def _depends(closed: ClosedJaxpr, linear: int) -> list[bool]:
 def _transpose(cotangents: Any, *numbers: Any, program: _Program) -> list:
     wanted = [ad.is_undefined_primal(x) for x in numbers]
     unknown, known = _split(wanted, numbers)
-    given = [not isinstance(ct, ad.Zero) for ct in cotangents]
-    cotangents, _ = _split(given, cotangents)
+    has_cotangent = [not isinstance(ct, ad.Zero) for ct in cotangents]
+    cotangents, _ = _split(has_cotangent, cotangents)
 
     def pulled(known, cotangents):
-        push = lambda *own: _split(given, program(_merged(wanted, own, known)))[0]
+        push = lambda *own: _split(has_cotangent, program(_merged(wanted, own, known)))[0]
         return jax.linear_transpose(push, *(x.aval for x in unknown))(cotangents)
 
     closed = jax.make_jaxpr(pulled)(known, cotangents)
@@ -179,22 +180,23 @@ def _lanes(numbers: Any, axes: Any, *, program: _Program) -> tuple[list, list[in
     of_lane = lambda own: program(_merged(batched, own, shared))
     still = len(batched) - program.linear
     if any(map(_is_sharded, own)):
-        # Each device has lanes of its own.
+        # Each device computes its own lanes.
         out = jax.vmap(of_lane)(own)
     elif program.linear and not any(batched[:still]):
-        # Directions at one point, side by side: they share all but themselves.
+        # Many directions at one point share everything but the directions themselves.
         closed = jax.make_jaxpr(jax.vmap(of_lane))(own)
         out = _run(closed, own, [True] * len(closed.out_avals), len(own))
     else:
-        # One after the other: for few lanes the calls of the operations take longer than
-        # all of a lane, and many do not fit into the cache.
+        # The lanes run one after the other. With few lanes side by side, calling the
+        # operations would take longer than a whole lane in one function; many lanes side
+        # by side do not fit into the cache.
         bind = functools.partial(ONE_FUNCTION.bind, program=program)
         out = jax.lax.map(lambda own: bind(*_merged(batched, own, shared)), own)
     return out, [0] * len(out)
 
 
 def _is_sharded(x: Array) -> bool:
-    """Over the axes of a mesh that JAX has as parts of types."""
+    """Whether an array is sharded over axes of a mesh that its type names."""
     return any(axis is not None for axis in jax.typeof(x).sharding.spec)
 
 
@@ -214,6 +216,6 @@ def _split(which: Sequence[bool], values: Sequence[Any]) -> tuple[list, list]:
 
 
 def _merged(which: Sequence[bool], chosen: Sequence[Any], rest: Sequence[Any]) -> list:
-    """What `_split` has split."""
-    left, others = iter(chosen), iter(rest)
-    return [next(left if on else others) for on in which]
+    """The inverse of `_split`."""
+    first, others = iter(chosen), iter(rest)
+    return [next(first if on else others) for on in which]

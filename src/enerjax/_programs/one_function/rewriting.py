@@ -1,8 +1,8 @@
-"""Programs in other words, where these are possible in one function.
+"""Programs rewritten with primitives that are possible in one function.
 
-Products of matrices become sums of products. Entries that are put or added to places which
-are known when the program is traced, as derivatives of `x[indices]` are, are picked from
-there: XLA has no scattering inside of one function, but gathering.
+Products of matrices become sums of products. A scatter to places that are known while the
+program is traced, as in the derivative of `x[indices]`, becomes a gather: XLA can gather
+inside of one function, but not scatter.
 """
 
 from collections.abc import Sequence
@@ -16,28 +16,29 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
 from jaxtyping import Array, Int
 
+from ..primitives import CONTRACTION, SCATTERS
 from ..tracing import evaluate, interpret, programs_within, wrapped_program
 from .possible import is_small_product, LARGEST_SUM, NAME
 from .products import written_out
 
 
 def rewritten(jaxpr: Any, known: Sequence[np.ndarray | None]) -> ClosedJaxpr:
-    """A program of those numbers alone whose values are not known."""
+    """The program, rewritten, as a function of the inputs whose values are not known."""
     inputs = [*jaxpr.constvars, *jaxpr.invars]
-    rest = [x for x, value in zip(inputs, known, strict=True) if value is None]
+    unknown = [x for x, value in zip(inputs, known, strict=True) if value is None]
 
     def program(*numbers: Array) -> list[Any]:
-        left = iter(numbers)
-        values = [next(left) if value is None else value for value in known]
+        remaining = iter(numbers)
+        values = [next(remaining) if value is None else value for value in known]
         count = len(jaxpr.constvars)
         return interpret(jaxpr, values[:count], values[count:], _equation)
 
-    like = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in rest]
+    like = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in unknown]
     return jax.make_jaxpr(program)(*like)
 
 
 def as_index(x: Any) -> np.ndarray | None:
-    """An array of indices that is known."""
+    """The array of indices that `x` is, if its values are known."""
     if isinstance(x, Tracer) or jnp.ndim(x) == 0:
         return None
     is_whole = getattr(x.dtype, "kind", "key") in "iub"
@@ -47,17 +48,17 @@ def as_index(x: Any) -> np.ndarray | None:
 def _equation(eqn: Any, values: list[Any]) -> list[Any]:
     values = [_known(*pair) for pair in zip(eqn.invars, values, strict=True)]
     name, params = eqn.primitive.name, eqn.params
-    whole = all(not jnp.issubdtype(x.aval.dtype, jnp.inexact) for x in eqn.outvars)
-    if whole and all(isinstance(x, np.ndarray) for x in values):
+    is_index = all(not jnp.issubdtype(x.aval.dtype, jnp.inexact) for x in eqn.outvars)
+    if is_index and all(isinstance(x, np.ndarray) for x in values):
         with jax.ensure_compile_time_eval():
             return [np.asarray(x) for x in evaluate(eqn.primitive, values, params)]
-    if _is_at_fault(eqn):
-        if name == "dot_general" and eqn.outvars[0].aval.size <= LARGEST_SUM:
+    if _must_be_replaced(eqn):
+        if name == CONTRACTION and eqn.outvars[0].aval.size <= LARGEST_SUM:
             left, right = values
             return [written_out(left, right, params["dimension_numbers"])]
-        if name in _SCATTERS and isinstance(values[1], np.ndarray):
+        if name in SCATTERS and isinstance(values[1], np.ndarray):
             return [_scattered(name, values, params)]
-    elif any(map(_has_fault, programs_within(eqn))):
+    elif any(map(_needs_rewriting, programs_within(eqn))):
         if name in _LOOPS:
             return _LOOPS[name](values, params)
         inner = wrapped_program(eqn)
@@ -67,21 +68,21 @@ def _equation(eqn: Any, values: list[Any]) -> list[Any]:
 
 
 def _known(atom: Any, value: Any) -> Any:
-    """An index as an array of NumPy, also where it is written into the program."""
+    """A value, as a NumPy array where it is an index written into the program."""
     if not isinstance(atom, Literal):
         return value
     found = np.asarray(atom.val, value.dtype)
     return value if jnp.issubdtype(found.dtype, jnp.inexact) else found
 
 
-def _is_at_fault(eqn: Any) -> bool:
+def _must_be_replaced(eqn: Any) -> bool:
     name = eqn.primitive.name
-    return name in _SCATTERS or (name == "dot_general" and not is_small_product(eqn))
+    return name in SCATTERS or (name == CONTRACTION and not is_small_product(eqn))
 
 
-def _has_fault(jaxpr: Any) -> bool:
+def _needs_rewriting(jaxpr: Any) -> bool:
     return any(
-        _is_at_fault(eqn) or any(map(_has_fault, programs_within(eqn)))
+        _must_be_replaced(eqn) or any(map(_needs_rewriting, programs_within(eqn)))
         for eqn in jaxpr.eqns
         if eqn.primitive.name != NAME
     )
@@ -90,7 +91,7 @@ def _has_fault(jaxpr: Any) -> bool:
 # Loops and branches -----------------------------------------------------------------------
 
 
-def _of(closed: ClosedJaxpr, values: list[Any]) -> list[Any]:
+def _outputs(closed: ClosedJaxpr, values: list[Any]) -> list[Any]:
     out = interpret(closed.jaxpr, closed.consts, values, _equation)
     return [
         jnp.asarray(x, aval.dtype) for x, aval in zip(out, closed.out_avals, strict=True)
@@ -104,7 +105,7 @@ def _scan(values: list[Any], params: dict[str, Any]) -> list[Any]:
     pick = lambda numbers: [values[k] for k in numbers]
 
     def turn(carry, row):
-        out = _of(inner, [*pick(consts), *carry, *row])
+        out = _outputs(inner, [*pick(consts), *carry, *row])
         return out[:count], out[count:]
 
     how = {key: params[key] for key in ("length", "reverse", "unroll")}
@@ -115,21 +116,21 @@ def _scan(values: list[Any], params: dict[str, Any]) -> list[Any]:
 def _while(values: list[Any], params: dict[str, Any]) -> list[Any]:
     first, second = params["cond_nconsts"], params["body_nconsts"]
     outer, inner = values[:first], values[first : first + second]
-    goes_on = lambda carry: _of(params["cond_jaxpr"], [*outer, *carry])[0]
-    turn = lambda carry: _of(params["body_jaxpr"], [*inner, *carry])
+    goes_on = lambda carry: _outputs(params["cond_jaxpr"], [*outer, *carry])[0]
+    turn = lambda carry: _outputs(params["body_jaxpr"], [*inner, *carry])
     return lax.while_loop(goes_on, turn, list(map(jnp.asarray, values[first + second :])))
 
 
 def _cond(values: list[Any], params: dict[str, Any]) -> list[Any]:
     number, *operands = values
-    branches = [lambda _, b=branch: _of(b, operands) for branch in params["branches"]]
+    branches = [lambda _, b=branch: _outputs(b, operands) for branch in params["branches"]]
     return lax.switch(number, branches, None)
 
 
 _LOOPS = {"scan": _scan, "while": _while, "cond": _cond}
 
 
-# Entries to known places ------------------------------------------------------------------
+# Scatters to known places ----------------------------------------------------------------
 
 
 def _scattered(name: str, values: list[Any], params: dict[str, Any]) -> Array:
@@ -143,7 +144,8 @@ def _scattered(name: str, values: list[Any], params: dict[str, Any]) -> Array:
     order = np.argsort(places, kind="stable")
     order = order[places[order] >= 0]
     to = places[order]
-    # How many for the same place come before.
+    # The number of earlier updates of the same place: one pass over all places adds the
+    # first update of each, the next pass the second.
     before = np.arange(to.size) - np.searchsorted(to, to)
     source = np.full((1 + before.max(initial=-1), size), updates.size)
     source[before, to] = order
@@ -153,9 +155,8 @@ def _scattered(name: str, values: list[Any], params: dict[str, Any]) -> Array:
     return operand
 
 
-_SCATTERS = frozenset(("scatter", "scatter-add"))
-# Where that can be.
-REWRITTEN = _SCATTERS | {"dot_general"}
+# Primitives that this module replaces, where their indices are known and sizes allow it.
+REWRITTEN = SCATTERS | {CONTRACTION}
 
 
 def _picked(flat: Array, source: np.ndarray, shape: tuple[int, ...]) -> Array:
@@ -163,25 +164,25 @@ def _picked(flat: Array, source: np.ndarray, shape: tuple[int, ...]) -> Array:
 
 
 def _places(
-    shape: tuple[int, ...], index: np.ndarray, of_updates: tuple[int, ...], params: Any
+    shape: tuple[int, ...], index: np.ndarray, update_shape: tuple[int, ...], params: Any
 ) -> Int[np.ndarray, " updates"]:
-    """Where in a flat array each of some flat updates falls; below zero for nowhere."""
-    dims, grid = params["dimension_numbers"], np.indices(of_updates)
+    """The place in the flat array of each flat update; negative if it is dropped."""
+    dims, grid = params["dimension_numbers"], np.indices(update_shape)
     windows, shared = dims.update_window_dims, dims.operand_batching_dims
-    at = [grid[k] for k in range(len(of_updates)) if k not in windows]
+    at = [grid[k] for k in range(len(update_shape)) if k not in windows]
     starts = index[tuple(at)]
     skipped = (*dims.inserted_window_dims, *shared)
     inner = [k for k in range(len(shape)) if k not in skipped]
-    first, within = np.zeros((2, len(shape), *of_updates), int)
+    first, within = np.zeros((2, len(shape), *update_shape), int)
     room = np.array(shape) - 1
     for axis, k in zip(inner, windows, strict=True):
         within[axis] = grid[k]
-        room[axis] -= of_updates[k] - 1
+        room[axis] -= update_shape[k] - 1
     for k, axis in enumerate(dims.scatter_dims_to_operand_dims):
         first[axis] = starts[..., k]
     for axis, k in zip(shared, dims.scatter_indices_batching_dims, strict=True):
         first[axis] = at[k]
-    room = room.reshape(-1, *[1] * len(of_updates))
+    room = room.reshape(-1, *[1] * len(update_shape))
     if params["mode"] == lax.GatherScatterMode.CLIP:
         first = np.clip(first, 0, room)
     falls = np.all((first >= 0) & (first <= room), axis=0)

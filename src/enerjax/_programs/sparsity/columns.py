@@ -8,7 +8,8 @@ not computed with respect to multipliers too.
 """
 
 import functools
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -18,9 +19,15 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..one_function.possible import LARGEST_SUM
+from ..primitives import ARITHMETIC, JIT
 from ..tracing import evaluate, interpret
 from .data_movement import MOVES
-from .nonzero_ranges import ELEMENTWISE, ends, filled_after, moved
+
+
+# Tables of nonzero entries with more truth values than this are not computed.
+_LARGEST_TABLE = 2**15
+# Primitives that are applied to columns as they are applied to the array itself.
+_IN_COLUMNS = ARITHMETIC | {"copy"}
 
 
 def columns_along(
@@ -43,43 +50,43 @@ def jacobian_columns(
 
 
 class _Columns:
-    """An array with an axis more, the last one, in which its columns follow each other.
+    """An array of the program with one more axis, the last one, along its columns.
 
-    - `numbers`: of the columns that it has; in the others it is zero. An array of NumPy is
-      known while the program is traced.
-    - `filled`: which entries can differ from zero in which of all columns; `None` where
-      there are too many to ask.
+    - `array`: a NumPy array where the values are known while the program is traced.
+    - `numbers`: which columns the array has; it is zero in all others.
+    - `nonzero`: which entries can differ from zero, over all columns; `None` if there are
+      too many entries to keep such a table.
     """
 
     def __init__(
-        self, array: Array | np.ndarray, numbers: range, filled: np.ndarray | None
+        self, array: Array | np.ndarray, numbers: range, nonzero: np.ndarray | None
     ):
         self.array = array
         self.numbers = numbers
-        self.filled = filled
+        self.nonzero = nonzero
 
 
 def _trimmed(
-    array: Array | np.ndarray, numbers: range, filled: np.ndarray | None
+    array: Array | np.ndarray, numbers: range, nonzero: np.ndarray | None
 ) -> _Columns:
-    """Without columns at both ends that are zero."""
-    if filled is None:
+    """The columns without those at both ends that are zero."""
+    if nonzero is None:
         return _Columns(array, numbers, None)
-    own = ends(filled)
+    own = _nonzero_range(nonzero)
     if own != numbers:
         start = own.start - numbers.start
         array = array[..., start : start + len(own)] if own else array[..., :0]
-    return _Columns(array, own, filled)
+    return _Columns(array, own, nonzero)
 
 
 def _known(array: np.ndarray, numbers: range, count: int) -> _Columns:
-    filled = np.zeros((*array.shape[:-1], count), bool)
-    filled[..., numbers.start : numbers.stop] = array != 0
-    return _trimmed(array, numbers, filled)
+    nonzero = np.zeros((*array.shape[:-1], count), bool)
+    nonzero[..., numbers.start : numbers.stop] = array != 0
+    return _trimmed(array, numbers, nonzero)
 
 
 def _in_columns(value: "Array | _Columns", numbers: range) -> Array:
-    """With the columns of these numbers, also where it does not depend on the seeds."""
+    """The array of a value with just these columns, of a constant too."""
     if not isinstance(value, _Columns):
         value = jnp.asarray(value)
         return jnp.broadcast_to(value[..., None], (*value.shape, len(numbers)))
@@ -88,22 +95,22 @@ def _in_columns(value: "Array | _Columns", numbers: range) -> Array:
         return array
     if not range(max(own.start, numbers.start), min(own.stop, numbers.stop)):
         return jnp.zeros((*array.shape[:-1], len(numbers)), array.dtype)
-    # (Padding below zero takes columns away.)
+    # Negative padding takes columns away.
     before, after = own.start - numbers.start, numbers.stop - own.stop
     config = (*((0, 0, 0) for _ in array.shape[:-1]), (before, after, 0))
     return lax.pad(array, jnp.zeros((), array.dtype), config)
 
 
 def _hull(values: list[Any]) -> range:
-    """From the first to the last column that some of the values have."""
+    """The range from the first to the last column that any of the values has."""
     numbers = [x.numbers for x in values if isinstance(x, _Columns) and x.numbers]
     if not numbers:
         return range(0)
     return range(min(x.start for x in numbers), max(x.stop for x in numbers))
 
 
-# Parts in which a large sum is taken.
-_PARTS = 8
+# A sum is cut into at most so many parts.
+_MAX_PARTS = 8
 
 
 def _broadcast(x, k, *, shape, broadcast_dimensions, **_):
@@ -129,9 +136,9 @@ def _transposed(x, k, *, permutation):
 
 
 def _summed(x, k, *, axes, **_):
-    # In parts that are small enough for one function.
+    # Each part is small enough to be a sum inside of one function of machine code.
     count = max(-(-x.size // LARGEST_SUM), 1)
-    if count > min(k, _PARTS):
+    if count > min(k, _MAX_PARTS):
         return jnp.sum(x, axis=axes)
     parts = (jnp.sum(part, axis=axes) for part in jnp.array_split(x, count, axis=-1))
     return jnp.concatenate([*parts], axis=-1)
@@ -141,8 +148,8 @@ def _split(x, k, *, sizes, axis):
     return lax.split(x, sizes, axis)
 
 
-# Of primitives with one operand.
-_MOVES = {
+# Primitives with one operand, applied to an array with columns.
+_WITH_COLUMNS = {
     "broadcast_in_dim": _broadcast,
     "reduce_sum": _summed,
     "reshape": _reshaped,
@@ -157,30 +164,30 @@ def _equation(equation: Any, values: list[Any], count: int) -> list[Any]:
     primitive, params, name = equation.primitive, equation.params, equation.primitive.name
     if not any(isinstance(x, _Columns) for x in values):
         return evaluate(primitive, values, params)
-    if name in ("jit", "pjit"):
+    if name in JIT:
         inner = params["jaxpr"]
         rule = functools.partial(_equation, count=count)
         return interpret(inner.jaxpr, inner.consts, values, rule)
-    # All is linear, unless a rule asks whether a tangent is zero.
+    # Everything is linear but rules that compare a tangent with zero.
     is_linear = all(jnp.issubdtype(x.aval.dtype, jnp.inexact) for x in equation.outvars)
     numbers = _hull(values) if is_linear else range(count)
-    masks = [x.filled if isinstance(x, _Columns) else False for x in values]
-    filled = filled_after(equation, masks, count) if is_linear else None
+    masks = [x.nonzero if isinstance(x, _Columns) else False for x in values]
+    nonzero = _nonzero_after(equation, masks, count) if is_linear else None
     first = values[0]
     if name in MOVES and len(values) == 1 and isinstance(first.array, np.ndarray):
-        # Of the seeds, before the arithmetic begins.
-        out = moved(MOVES[name], [first.array], params)
+        # The seeds are moved while their values are known, before the arithmetic begins.
+        out = _moved_rows(MOVES[name], [first.array], params)
         return [_known(x, first.numbers, count) for x in out]
-    if filled is not None and len(filled) == 1:
-        numbers = ends(filled[0])
+    if nonzero is not None and len(nonzero) == 1:
+        numbers = _nonzero_range(nonzero[0])
     if not numbers:
         out = [jnp.zeros((*x.aval.shape, 0), x.aval.dtype) for x in equation.outvars]
-    elif name in ELEMENTWISE:
+    elif name in _IN_COLUMNS:
         arrays = [_in_columns(x, numbers) for x in values]
         shape = jnp.broadcast_shapes(*(x.shape for x in arrays))
         out = evaluate(primitive, [jnp.broadcast_to(x, shape) for x in arrays], params)
-    elif name in _MOVES and len(values) == 1:
-        out = _MOVES[name](_in_columns(first, numbers), len(numbers), **params)
+    elif name in _WITH_COLUMNS and len(values) == 1:
+        out = _WITH_COLUMNS[name](_in_columns(first, numbers), len(numbers), **params)
         out = out if primitive.multiple_results else [out]
     elif name == "concatenate":
         arrays = [_in_columns(x, numbers) for x in values]
@@ -190,16 +197,67 @@ def _equation(equation: Any, values: list[Any], count: int) -> list[Any]:
         out = [lax.pad(_in_columns(first, numbers), jnp.asarray(values[1]), config)]
     else:
         out = _by_vmap(primitive, values, params, numbers)
-    filled = [None] * len(out) if filled is None else filled
-    return [_trimmed(x, numbers, own) for x, own in zip(out, filled, strict=True)]
+    nonzero = [None] * len(out) if nonzero is None else nonzero
+    return [_trimmed(x, numbers, own) for x, own in zip(out, nonzero, strict=True)]
 
 
 def _by_vmap(
     primitive: Any, values: list[Any], params: dict[str, Any], numbers: range
 ) -> list[Array]:
-    """Of any other primitive."""
-    moved = [isinstance(x, _Columns) for x in values]
+    """The outputs of any other primitive, by `jax.vmap` over the columns."""
+    has_columns = [isinstance(x, _Columns) for x in values]
     arrays = [_in_columns(x, numbers) if isinstance(x, _Columns) else x for x in values]
-    axes = [x.ndim - 1 if on else None for x, on in zip(arrays, moved, strict=True)]
+    axes = [x.ndim - 1 if on else None for x, on in zip(arrays, has_columns, strict=True)]
     apply = lambda *arrays: evaluate(primitive, list(arrays), params)
     return jax.vmap(apply, in_axes=axes, out_axes=-1)(*arrays)
+
+
+# Which entries of tangents can differ from zero in which columns --------------------------
+
+# The tables are computed while the program is traced, before any entry has a value. They
+# hold truth values; their last axis are the columns.
+
+
+def _nonzero_after(
+    equation: Any, masks: Sequence[Any], count: int
+) -> list[np.ndarray] | None:
+    """The tables of the outputs of an equation.
+
+    `masks` are the tables of its inputs, `False` for constants. `None` is returned where an
+    input has no table, or where the tables would be too large.
+    """
+    name, params = equation.primitive.name, equation.params
+    shapes = [(*x.aval.shape, count) for x in equation.outvars]
+    if max(map(math.prod, shapes)) > _LARGEST_TABLE or any(mask is None for mask in masks):
+        return None
+    pairs = zip(equation.invars, masks, strict=True)
+    tables = [np.broadcast_to(mask, (*x.aval.shape, count)) for x, mask in pairs]
+    if name in _IN_COLUMNS:
+        return [np.broadcast_to(functools.reduce(np.logical_or, tables), shapes[0])]
+    if name == "reduce_sum":
+        return [np.asarray(np.any(tables[0], axis=params["axes"]))]
+    if name in MOVES:
+        return _moved_rows(MOVES[name], tables, params)
+    columns = [np.any(x, axis=tuple(range(x.ndim - 1))) for x in tables]
+    union = functools.reduce(np.logical_or, columns)
+    return [np.broadcast_to(union, shape) for shape in shapes]
+
+
+def _moved_rows(
+    move: Callable, tables: Sequence[np.ndarray], params: dict[str, Any]
+) -> list[np.ndarray]:
+    """Tables with a row for each entry, after a primitive has moved the entries."""
+    places, rows, first = [], [], 0
+    for table in tables:
+        *shape, width = table.shape
+        rows.append(np.reshape(table, (math.prod(shape), width)))
+        places.append(np.arange(first, first + len(rows[-1])).reshape(shape))
+        first += len(rows[-1])
+    joined = np.concatenate(rows)
+    return [joined[out.astype(int)] for out in move(*places, **params)]
+
+
+def _nonzero_range(nonzero: np.ndarray) -> range:
+    """The range from the first to the last column with a nonzero entry."""
+    some = np.flatnonzero(np.any(nonzero, axis=tuple(range(nonzero.ndim - 1))))
+    return range(int(some[0]), int(some[-1]) + 1) if some.size else range(0)

@@ -1,6 +1,6 @@
-"""Primitives that only move entries, on arrays of NumPy.
+"""Primitives that only move entries, for NumPy arrays.
 
-JAX would compile a program for every shape that it meets.
+With JAX itself every new shape would compile a program.
 """
 
 from collections.abc import Callable

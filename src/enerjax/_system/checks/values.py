@@ -76,71 +76,78 @@ def _is_quadratic(
 
 
 def check_values(system: AbstractSystem, state: State, args: Args) -> None:
+    """Raises for the first number of a system that makes no sense, if it is known."""
     facts = _facts(system, state, args)
     if not is_known(facts):  # the functions of the system close over traced numbers
         return
     functions = {role: describe(role, fn) for role, fn, _ in energies(system, state, args)}
     kinetic = functions.get("kinetic", functions.get("hamiltonian"))
     potential = functions.get("potential", kinetic)
+    messages = _messages_of_start(potential, state, args) | _messages_of_inertia(
+        system, kinetic
+    )
+    for name, message in messages.items():
+        if not facts[name]:
+            raise ValueError(message)
+
+
+def _messages_of_start(potential: str | None, state: State, args: Args) -> dict[str, str]:
+    """What to say where the start, a force, a potential or a constraint makes no sense."""
+    return {
+        "start": f"The start is not finite: q = {state.q}, v = {state.v}.",
+        "args": f"`args` holds a number that is not finite: {args}.",
+        "potential": (
+            f"{potential} is not finite at the start, q = {state.q}. Is it defined there?"
+        ),
+        "timed": (
+            f"`force` or `driven` is not finite at the start, t = {state.t}. Is it defined "
+            "there?"
+        ),
+        "slope": (
+            f"The slope of {potential} is not finite at the start, q = {state.q}. It must "
+            "be differentiable there: the norm of a vector that vanishes is not, nor the "
+            "root of zero."
+        ),
+        "constraint": "The constraints are not finite at the start. Defined there?",
+        "slopes": (
+            f"The slope of a constraint is not finite at the start, q = {state.q}. Write "
+            "lengths as squares: `d @ d - l**2`."
+        ),
+        "depends": (
+            "A row of the constraints does not depend on `q` at the start: is it constant, "
+            "or the square of what vanishes?"
+        ),
+    }
+
+
+def _messages_of_inertia(system: AbstractSystem, kinetic: str | None) -> dict[str, str]:
+    """What to say where the inertia makes no sense."""
     inertia, missing = "inertia matrix", "A coordinate without mass, or a negative mass?"
+    not_smooth = (
+        " A kinetic energy must have second derivatives at `v = 0`: write `v @ v`, not the "
+        "square of a norm."
+    )
     if isinstance(system, HamiltonianSystem):
         inertia = f"inverse Hessian of {kinetic} in the momenta"
         missing = "Is a momentum without energy, or at a singular configuration?"
+        not_smooth = f" {missing}"
     elif kinetic is not None:
         inertia = f"inertia (the Hessian of {kinetic})"
     if isinstance(system, LagrangianSystem):
         missing += " Or are the coordinates singular at the start (polar ones at r = 0)?"
-    elsewhere = " Inertia that varies: `System.from_lagrangian`."
+    varies = " Inertia that varies: `System.from_lagrangian`."
     if not isinstance(system, System):
-        elsewhere = ""
-    for name, message in (
-        ("start", f"The start is not finite: q = {state.q}, v = {state.v}."),
-        ("args", f"`args` holds a number that is not finite: {args}."),
-        (
-            "potential",
-            f"{potential} is not finite at the start, q = {state.q}. Is it defined there?",
-        ),
-        (
-            "timed",
-            f"`force` or `driven` is not finite at the start, t = {state.t}. Is it defined "
-            "there?",
-        ),
-        (
-            "slope",
-            f"The slope of {potential} is not finite at the start, q = {state.q}. It must "
-            "be differentiable there: the norm of a vector that vanishes is not, nor the "
-            "root of zero.",
-        ),
-        ("constraint", "The constraints are not finite at the start. Defined there?"),
-        (
-            "slopes",
-            f"The slope of a constraint is not finite at the start, q = {state.q}. Write "
-            "lengths as squares: `d @ d - l**2`.",
-        ),
-        (
-            "depends",
-            "A row of the constraints does not depend on `q` at the start: is it constant, "
-            "or the square of what vanishes?",
-        ),
-        (
-            "inertia",
-            f"The {inertia} is not finite. {missing}"
-            if isinstance(system, HamiltonianSystem)
-            else f"The {inertia} is not finite. A kinetic energy must have second "
-            "derivatives at `v = 0`: write `v @ v`, not the square of a norm.",
-        ),
-        (
-            "quadratic",
+        varies = ""
+    return {
+        "inertia": f"The {inertia} is not finite.{not_smooth}",
+        "quadratic": (
             f"{kinetic} is not quadratic in the velocities: it must be `1/2 v . M v`, with "
-            f"no linear or constant part.{elsewhere} Other energies: "
-            "`System.from_hamiltonian`.",
+            f"no linear or constant part.{varies} Other energies: "
+            "`System.from_hamiltonian`."
         ),
-        ("symmetric", f"The {inertia} is not symmetric."),
-        (
-            "definite",
+        "symmetric": f"The {inertia} is not symmetric.",
+        "definite": (
             f"The {inertia} is not positive definite. {missing} Every velocity needs some "
-            "inertia.",
+            "inertia."
         ),
-    ):
-        if not facts[name]:
-            raise ValueError(message)
+    }
