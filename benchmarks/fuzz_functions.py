@@ -121,7 +121,7 @@ UNARY: dict[str, Callable] = {
     "remainder": lambda x: jnp.mod(x, 1.3),
     "sign": lambda x: jnp.sign(x) * jnp.sqrt(0.1 + jnp.abs(x)),
     "power": lambda x: (0.3 + jnp.abs(x)) ** 1.7,
-    "variance": lambda x: jnp.sin(x) * jnp.std(x + jnp.arange(SIZE)),
+    "variance": lambda x: jnp.sin(x) * jnp.std(x + jnp.arange(SIZE, dtype=x.dtype)),
     "quaternion": lambda x: jnp.append(
         jnp.cross(x[:3], x[3:]), x[:3] / jnp.sqrt(0.1 + x[:3] @ x[:3])
     ),

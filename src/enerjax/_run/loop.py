@@ -141,8 +141,7 @@ def run_loop(
         return stepper.attempt(progress, live & ~is_done(progress))
 
     def one_group(before: Progress, live: Flag) -> tuple[Progress, Record]:
-        lives = jnp.full((steps_in_group,), live)
-        after, attempts = over_steps(keep_roots(one_step), before, lives)
+        after, attempts = over_steps(keep_roots(one_step), before, steps_in_group, live)
         numbers = jnp.arange(steps_in_group)
         last = jnp.max(jnp.where(attempts.accepted, numbers, 0))
         return after, Record(
@@ -157,7 +156,7 @@ def run_loop(
 
     begin = stepper.begin(start)
     kept = Begin(keep(begin.state, begin.place), begin.multipliers)
-    end, record = over_groups(one_group, begin, jnp.ones((num_groups,), bool))
+    end, record = over_groups(one_group, begin, num_groups, jnp.array(True))
     arrived = RESULTS.where(
         end.place >= plan.last, RESULTS.successful, RESULTS.out_of_steps
     )

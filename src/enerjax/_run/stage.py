@@ -137,13 +137,9 @@ def solve(
 
     inputs = (scheme, problem, unknown_scale, row_scale)
 
-    # Smooth motion is met by extrapolation; where it changes quickly the last step is
-    # the better guess. What would have been better for the step before decides.
-    smooth = jax.tree.map(_next, memory.added)
-    last = jax.tree.map(lambda x: x[0], memory.added)
-    choose = lambda x, y: jnp.where(memory.is_smooth, x, y)
-    added = jax.tree.map(choose, smooth, last)
-    guess = jax.tree.map(lambda x0, x, s: (x0 + x) / s, flight, added, unknown_scale)
+    guess = jax.tree.map(
+        lambda x0, x, s: (x0 + x) / s, flight, _predicted(memory), unknown_scale
+    )
     scale_down = lambda z: jax.tree.map(jnp.divide, z, unknown_scale)
     root = find_root(
         scaled,
@@ -162,23 +158,53 @@ def solve(
     )
     z = jax.tree.map(jnp.multiply, root.value, unknown_scale)
     end = scheme.finish(z, problem)
-    result = from_root_finder(root.found, root.broken, root.finite)
-    turned = RESULTS.where(
-        _turns(model, start, end.state), RESULTS.step_too_large, RESULTS.successful
-    )
-    result = first_failure(first_failure(end.result, result), turned)
+    found = from_root_finder(root.found, root.broken, root.finite)
+    turns = _turns(model, start, end.state)
+    turned = RESULTS.where(turns, RESULTS.step_too_large, RESULTS.successful)
     added = jax.lax.stop_gradient(jax.tree.map(jnp.subtract, z, flight))
-    off = lambda x: max_norm(
-        jax.tree.map(lambda x, y, unit: (x - y) / unit, added, x, unknown_scale)
+    return Solved(
+        end=end,
+        iterations=root.iterations,
+        residual=root.residual,
+        result=first_failure(first_failure(end.result, found), turned),
+        roughness=roughness(model.scales.coordinate, added, memory.added, unknown_scale),
+        memory=_memory_after(memory, added, unknown_scale, root.factors, end.carried),
     )
-    after = Memory(
-        jax.tree.map(_pushed, added, memory.added),
-        off(smooth) <= off(last),
-        jax.tree.map(_pushed, root.factors, memory.factors),
-        end.carried,
+
+
+def _predicted(memory: Memory) -> PyTree[Any]:
+    """What a step is expected to add to a free flight.
+
+    Smooth motion is met by extrapolation; where it changes quickly the last step is the
+    better guess. What would have been better for the step before decides.
+    """
+    smooth = jax.tree.map(_next, memory.added)
+    last = jax.tree.map(lambda x: x[0], memory.added)
+    choose = lambda x, y: jnp.where(memory.is_smooth, x, y)
+    return jax.tree.map(choose, smooth, last)
+
+
+def _memory_after(
+    memory: Memory,
+    added: PyTree[Any],
+    unknown_scale: PyTree[Any],
+    factors: AbstractFactors | None,
+    carried: PyTree[Any],
+) -> Memory:
+    """The memory with a step that added `added` to a free flight."""
+
+    def error(guess: PyTree[Any]) -> Scalar:
+        difference = lambda x, y, unit: (x - y) / unit
+        return max_norm(jax.tree.map(difference, added, guess, unknown_scale))
+
+    smooth = jax.tree.map(_next, memory.added)
+    last = jax.tree.map(lambda x: x[0], memory.added)
+    return Memory(
+        added=jax.tree.map(_pushed, added, memory.added),
+        is_smooth=error(smooth) <= error(last),
+        factors=jax.tree.map(_pushed, factors, memory.factors),
+        carried=carried,
     )
-    rough = roughness(model.scales.coordinate, added, memory.added, unknown_scale)
-    return Solved(end, root.iterations, root.residual, result, rough, after)
 
 
 def _next(x: Array) -> Array:
