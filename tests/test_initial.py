@@ -241,3 +241,17 @@ def test_a_lane_without_a_start_leaves_the_others_alone():
     assert np.isnan(starts.q).all(axis=1).tolist() == [False, True, False]
     expected = guesses[0] / jnp.linalg.norm(guesses[0])
     np.testing.assert_allclose(starts.q[0], expected, atol=4 * EPS)
+
+
+@pytest.mark.parametrize(("angle", "tolerance"), [(1e-2, 4 * EPS), (1e-3, 1e-11)])
+def test_known_velocities_are_kept_in_a_nearly_singular_pose(angle, tolerance):
+    """A pendulum near the horizontal, of which the small velocity along the rod is known.
+
+    Tolerance: round-off; closer to the singular pose, what four corrections leave.
+    """
+    rod = lambda q, args: jnp.array([q @ q - 1])
+    system = ej.System(lambda v, args: 0.5 * v @ v, lambda q, args: 0.0 * q[0], rod)
+    q = [np.cos(angle), np.sin(angle)]
+    start = ej.initial_state(system, q, [0.1 * angle, 0.0], known_v=(0,))
+    tangential = -0.1 * angle / np.tan(angle)
+    np.testing.assert_allclose(start.v, [0.1 * angle, tangential], rtol=tolerance)

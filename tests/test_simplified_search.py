@@ -51,8 +51,8 @@ def test_what_is_simplified_of_a_chain_is_its_pattern(scheme, blocks):
     def exact(x):
         return ravel_pytree(scheme.residual(unravel(x), problem))[0]
 
-    def simplified(x, held=flat):
-        rows = scheme.simplified(unravel(x), unravel(held), problem)
+    def simplified(x):
+        rows = scheme.residual(unravel(x), problem.with_weak_couplings_held())
         return ravel_pytree(rows)[0]
 
     np.testing.assert_allclose(simplified(flat), exact(flat), rtol=1e-12, atol=1e-15)
@@ -61,7 +61,7 @@ def test_what_is_simplified_of_a_chain_is_its_pattern(scheme, blocks):
         assert pattern is not None
         assert Band(pattern).width == width
     # What it leaves out is weak, but there: it vanishes with the multipliers eta.
-    off = [jnp.max(jnp.abs(jax.jacfwd(exact)(x) - jax.jacfwd(simplified)(x, x)))
+    off = [jnp.max(jnp.abs(jax.jacfwd(exact)(x) - jax.jacfwd(simplified)(x)))
            for x in (flat, ravel_pytree(z)[0])]  # fmt: skip
     assert off[0] > 1e-6 > 1e-12 > off[1]
 
@@ -69,11 +69,19 @@ def test_what_is_simplified_of_a_chain_is_its_pattern(scheme, blocks):
 def _equations(strength):
     """A band, and a coupling far along it that the simplified equations leave out."""
 
-    def simplified(x, held, args):
+    def equations(x, far, args):
         near = 2 * x + 0.3 * jnp.sin(jnp.roll(x, 1).at[0].set(0)) - args
-        return near + strength * jnp.arctan(jnp.roll(held, 9).at[:9].set(0))
+        return near + strength * jnp.arctan(jnp.roll(far, 9).at[:9].set(0))
 
-    return simplified, lambda x, args: simplified(x, x, args)
+    return _simplified_and_exact(equations)
+
+
+def _simplified_and_exact(equations):
+    """`equations(x, far, args)` with and without the derivatives by way of `far`."""
+    return (
+        lambda x, args: equations(x, jax.lax.stop_gradient(x), args),
+        lambda x, args: equations(x, x, args),
+    )
 
 
 @pytest.mark.parametrize("strength", [1e-3, 0.3, 30.0])
@@ -85,7 +93,7 @@ def test_a_root_and_its_derivatives_do_not_depend_on_what_was_left_out(strength)
     def root(args):
         guess = jnp.zeros(SIZE)
         return find_root(
-            exact, Newton(), guess, args, max_iterations=50, simplified=simplified
+            exact, Newton(), guess, args, max_iterations=50, jacobian_of=simplified
         )
 
     found, change = jax.jit(lambda a: jax.jvp(lambda a: root(a).value, (a,), (a,)))(args)
@@ -106,20 +114,19 @@ def test_the_search_alone_is_simplified():
             ).iterations
         )
     )(args)
-    assert count(simplified=simplified) > count()
+    assert count(jacobian_of=simplified) > count()
 
 
 def test_lanes_that_need_the_exact_jacobian_move_alone():
     args = jnp.cos(jnp.arange(float(SIZE)))
 
     def root(strength):
-        def simplified(x, held, inputs):
-            strength, args = inputs
-            return _equations(strength)[0](x, held, args)
-
+        simplified, exact = (
+            lambda x, inputs, k=k: _equations(inputs[0])[k](x, inputs[1]) for k in (0, 1)
+        )
         return find_root(
-            lambda x, inputs: simplified(x, x, inputs), Newton(), jnp.zeros(SIZE),
-            (strength, args), max_iterations=50, simplified=simplified,
+            exact, Newton(), jnp.zeros(SIZE), (strength, args), max_iterations=50,
+            jacobian_of=simplified,
         )  # fmt: skip
 
     strengths = jnp.array([1e-3, 30.0])
@@ -135,21 +142,22 @@ def test_lanes_that_need_the_exact_jacobian_move_alone():
 def test_slow_corrections_are_not_taken_for_round_off(off):
     """Each leaves about half of the one before, from where they are small on."""
 
-    def simplified(x, held, args):
+    def equations(x, far, args):
         near = 2 * x + 0.3 * jnp.sin(jnp.roll(x, 1).at[0].set(0)) - args
-        far = jnp.roll(held, 9).at[:9].set(0) + jnp.roll(held, -9).at[-9:].set(0)
+        far = jnp.roll(far, 9).at[:9].set(0) + jnp.roll(far, -9).at[-9:].set(0)
         return near + 0.5 * jnp.sin(far)
+
+    simplified, exact = _simplified_and_exact(equations)
 
     def root(guess, args):
         return find_root(
-            lambda x, args: simplified(x, x, args), Newton(), guess, args,
-            max_iterations=50, simplified=simplified,
-        )  # fmt: skip
+            exact, Newton(), guess, args, max_iterations=50, jacobian_of=simplified
+        )
 
     args = jnp.cos(jnp.arange(float(SIZE)))
     noise = np.random.default_rng(0).normal(size=SIZE)
     at = jax.jit(root)(jnp.zeros(SIZE), args).value
     found = jax.jit(root)(at + off * noise, args)
     assert found.found
-    rest = simplified(found.value, found.value, args)
+    rest = exact(found.value, args)
     assert jnp.max(jnp.abs(rest)) <= 100 * EPS  # round-off

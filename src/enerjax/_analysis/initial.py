@@ -173,7 +173,7 @@ def _start(
 def _is_met(system: AbstractSystem, state: State, args: Args) -> Flag:
     """Whether nothing is left to do: the constraints hold to round-off, each for itself."""
     model = make_model(system, state, args)
-    inner = model.enter(state)
+    inner = model.to_internal(state)
     q, t, scales = inner.q, inner.t, model.scales
     eps = jnp.finfo(q.dtype).eps
     position = jnp.abs(model.constraint(q, t)) <= 2 * eps * scales.constraint_size
@@ -222,12 +222,12 @@ def _project(
     t = guess.t
     before = model.constraint(guess.q, t)
     q, near = project_position(model, guess, known[0])
-    given = model.enter(State(q, guess.v, t))
+    given = model.to_internal(State(q, guess.v, t))
     velocity, kept = project_velocity(model, given, known[1])
     state = State(q, velocity, t)
     acceleration, multipliers = model.accelerations(state)
     rates = State(model.lift(q, state.v), acceleration, jax.tree.map(jnp.ones_like, t))
-    user_state, user_rates = jax.jvp(model.leave, (state,), (rates,))
+    user_state, user_rates = jax.jvp(model.to_user, (state,), (rates,))
     start = ConsistentStart(
         user_state,
         user_rates.v,

@@ -171,7 +171,7 @@ def _linearised(
 ) -> tuple[Array, Array, Array, Array]:
     """The inertia in the coordinates; the constraints: gradients, residuals, sizes."""
     model = make_model(system, state, args)
-    metric = as_dense(model.metric(model.enter(state)))
+    metric = as_dense(model.metric(model.to_internal(state)))
     jacobian = jax.jacfwd(model.constraint)(state.q, state.t)
     residual = model.constraint(state.q, state.t)
     return metric, jacobian, residual, model.scales.constraint_size

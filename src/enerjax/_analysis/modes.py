@@ -126,7 +126,7 @@ def _modes(
         return rows if kept is None else rows[np.array(kept, int)]
 
     energy = lambda q: model.potential(State(q, rest.v))
-    root = cholesky(as_dense(model.metric(model.enter(rest))))
+    root = cholesky(as_dense(model.metric(model.to_internal(rest))))
     back = inverse(root)
     slope, jacobian = jax.grad(energy)(q), jax.jacfwd(held)(q)
     rows = jacobian @ back.T

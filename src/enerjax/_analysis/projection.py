@@ -75,7 +75,7 @@ def project_position(
     guess = state.q
     if model.scales.constraint.size == 0:
         return guess, jnp.array(True)
-    metric, coordinate = model.metric(model.enter(state)), model.scales.coordinate
+    metric, coordinate = model.metric(model.to_internal(state)), model.scales.coordinate
     size = largest(guess * coordinate)
     size = jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
     held = _Held(model, guess, state.t, known)
@@ -92,9 +92,11 @@ def project_position(
     inputs = (held, metric, size)
     zero = (jnp.zeros_like(guess), jnp.zeros_like(held.scales()[0]))
     tolerance = 1e2 * jnp.finfo(guess.dtype).eps
-    fill = model.fill(zero[1].size, guess.dtype)
-    fill = None if fill is None else (zero[0], fill)
-    root = find_root(conditions, Newton(), zero, inputs, max_iterations=50, fill=fill)
+    regularisation = model.regularisation(zero[1].size, guess.dtype)
+    regularisation = None if regularisation is None else (zero[0], regularisation)
+    root = find_root(
+        conditions, Newton(), zero, inputs, max_iterations=50, regularisation=regularisation
+    )
     x, found = root.value, root.found
     # Constraints that are met are not far; whether they are independent is told apart.
     met = largest(conditions(zero, inputs)[1]) <= tolerance
@@ -123,7 +125,7 @@ def _linear(held: _Held, metric: Symmetric) -> Flag:
             return jnp.concatenate([force / coordinate, change / unit])
 
         like = jnp.zeros((q.size + residual.size,), q.dtype)
-        x = affine_root(conditions, like, held.model.fill_behind(q, unit.size))
+        x = affine_root(conditions, like, held.model.regularisation_after(q, unit.size))
         return x[: q.size] / coordinate
 
     first = correction(held(q))
@@ -144,30 +146,34 @@ def project_velocity(
     unit = model.scales.constraint[: model.joint(q, t).size]
     rates = lambda x: model.joint_rate(q, x, t)
 
-    def correct(v: Velocities, held: Rows, unit: Array, fill: Array | None) -> Velocities:
-        mobility = model.mobility(State(q, v))
+    def correct(
+        v: Velocities, held: Rows, unit: Array, regularisation: Array | None
+    ) -> Velocities:
+        inverse_metric = model.inverse_metric(State(q, v))
         rate = held(v)
 
         def change(mu: Array) -> Velocities:
             _, transpose = jax.vjp(held, v)
-            return mobility @ transpose(mu / unit)[0]
+            return inverse_metric @ transpose(mu / unit)[0]
 
         remaining = lambda mu: (rate - jax.jvp(held, (v,), (change(mu),))[1]) / unit
-        return v - change(affine_root(remaining, rate, fill))
+        return v - change(affine_root(remaining, rate, regularisation))
 
-    end, root = v, jnp.sqrt(model.mobility(state).diagonal())
+    end, root = v, jnp.sqrt(model.inverse_metric(state).diagonal())
     if known:
         # What is known may follow from the joints too: their rows need not be independent.
         numbers = jnp.asarray(known, int)
         both = lambda x: jnp.concatenate([rates(x), (x - v)[numbers]])
         units = jnp.concatenate([unit, root[numbers]])
-        fill = jnp.full_like(units, -(eps**0.5))
-        for _ in range(2):  # the second takes back what the fill has changed
-            end = correct(end, both, units, fill)
+        regularisation = jnp.full_like(units, -(eps**0.5))
+        # The regularisation changes what the first correction does. Each further one takes
+        # back most of that: in a nearly singular pose two would leave an error of 1e-11.
+        toward = lambda end, _: (correct(end, both, units, regularisation), None)
+        end = jax.lax.scan(toward, end, None, length=4)[0]
     # Exact at once where the energy is a quadratic form of the momenta; else Newton.
     corrections = 8 if isinstance(model.system, HamiltonianSystem) else 1
-    fill = model.fill(unit.size, v.dtype)
-    again = lambda v, _: (correct(v, rates, unit, fill), None)
+    regularisation = model.regularisation(unit.size, v.dtype)
+    again = lambda v, _: (correct(v, rates, unit, regularisation), None)
     end = jax.lax.scan(again, end, None, length=corrections)[0]
     changed = largest(((end - v) / root)[jnp.asarray(known, int)])
     return end, changed <= eps**0.5 * largest(v / root)

@@ -1,8 +1,8 @@
 from .._system import AbstractCanonicalSystem, AbstractSystem, State, System
 from .._types import Args
-from .base import AbstractModel as AbstractModel
+from .base import AbstractModel as AbstractModel, Reaction as Reaction
 from .canonical import CanonicalModel as CanonicalModel
-from .interval import Drive as Drive, Increment as Increment, Time as Time
+from .interval import Gradient as Gradient, Increment as Increment, Time as Time
 from .scaling import (
     local_error as local_error,
     roughness as roughness,
@@ -10,7 +10,6 @@ from .scaling import (
     shortened as shortened,
 )
 from .separable import SeparableModel as SeparableModel
-from .sizes import force_size as force_size
 
 
 def make_model(system: AbstractSystem, state: State, args: Args) -> AbstractModel:

@@ -1,17 +1,17 @@
 """Any Hamiltonian `H(q, p)`, with `L = I`, `G = 0` and momenta as unknowns."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._discrete import AbstractDerivative
-from .._solvers import affine_root, as_dense
+from .._solvers import affine_root, as_dense, Symmetric
 from .._system import AbstractCanonicalSystem, State
 from .._types import Args, Coordinates, JointMultipliers, Multipliers, Scalar, Velocities
-from .base import AbstractModel
-from .interval import Drive, Increment, lapse_of, Scales, Time
-from .lapse import gradient_and_work
-from .sizes import action_size
+from .base import AbstractModel, Reaction
+from .interval import Gradient, gradient_and_work, Increment, Scales, Time, time_rate
 
 
 class CanonicalModel(AbstractModel):
@@ -24,7 +24,7 @@ class CanonicalModel(AbstractModel):
     def __init__(self, system: AbstractCanonicalSystem, state: State, args: Args):
         self.system = system
         self.args = args
-        self.scales = self._scales(self.enter(state))
+        self.scales = self._scales(self.to_internal(state))
 
     @property
     def has_own_momenta(self) -> bool:
@@ -34,10 +34,10 @@ class CanonicalModel(AbstractModel):
     def has_canonical_rates(self) -> bool:
         return True
 
-    def enter(self, state: State) -> State:
+    def to_internal(self, state: State) -> State:
         return State(state.q, self.system.momentum(state, self.args), state.t)
 
-    def leave(self, state: State) -> State:
+    def to_user(self, state: State) -> State:
         return State(state.q, self.system.velocity(state.q, state.v, self.args))
 
     def hamiltonian(self, q: Coordinates, p: Velocities) -> Scalar:
@@ -45,6 +45,13 @@ class CanonicalModel(AbstractModel):
 
     def kinetic(self, state: State) -> Scalar:
         return self.hamiltonian(state.q, state.v) - self.potential(state)
+
+    def kinetic_change(self, a: State, b: State, gradient: Gradient) -> Scalar:
+        return gradient.rate @ (b.v - a.v)
+
+    def kinetic_of_jump(self, a: State, b: State) -> Scalar:
+        rate = jax.grad(self.hamiltonian, argnums=1)
+        return 0.5 * (b.v - a.v) @ (rate(b.q, b.v) - rate(a.q, a.v))
 
     def potential(self, state: State) -> Scalar:
         return self.system.potential_energy(state, self.args)
@@ -58,9 +65,9 @@ class CanonicalModel(AbstractModel):
     def momentum(self, state: State) -> Velocities:
         return state.v
 
-    def gradient(self, state: State, h: Scalar) -> Drive:
+    def gradient(self, state: State, h: Scalar) -> Gradient:
         force, rate = jax.grad(self.hamiltonian, argnums=(0, 1))(state.q, state.v)
-        return Drive(h * force, rate)
+        return Gradient(h * force, rate)
 
     def slope(self, state: State) -> Coordinates:
         slope, rate = jax.grad(self.hamiltonian, argnums=(0, 1))(state.q, state.v)
@@ -71,20 +78,35 @@ class CanonicalModel(AbstractModel):
     def velocity(self, state: State) -> Velocities:
         return self.lift(state.q, state.v)
 
+    def velocity_change(
+        self, change: Velocities, inverse_inertia: Float[Array, "nq nq"] | Symmetric
+    ) -> Velocities:
+        return inverse_inertia @ change
+
+    def node_momenta(
+        self,
+        unknowns: tuple[Float[Array, " np"], ...],
+        velocities: Callable[[Reaction], tuple[Velocities, ...]],
+    ) -> tuple[Velocities, ...]:
+        return unknowns
+
+    def momentum_rows(self, rates: Velocities) -> Float[Array, " np"]:
+        return rates
+
     def push(self, qa: Coordinates, qb: Coordinates, rate: Coordinates) -> Velocities:
         return rate
 
     def pull(self, qa: Coordinates, qb: Coordinates, force: Velocities) -> Coordinates:
         return force
 
-    def drive(
+    def discrete_gradient(
         self,
         derivative: AbstractDerivative,
         a: State,
         b: State,
         h: Scalar,
         increment: Increment,
-    ) -> Drive:
+    ) -> Gradient:
         size = a.q.size
         fixed, driven = self.split(increment)
 
@@ -99,49 +121,68 @@ class CanonicalModel(AbstractModel):
                 out = out + fixed.impulse @ self.fixed(q)
             return out
 
-        def moved(z: Float[Array, " nz"], t: Time) -> Scalar:
+        def driven_action(z: Float[Array, " nz"], t: Time) -> Scalar:
             q = z[:size]
             return self.driven_action(q, self.lift(q, z[size:]), t, h, driven)
 
-        # Lengths of positions and momenta have no common measure but by a time.
+        # Positions and momenta have a common measure only by way of a time.
         middle = 0.5 * (a.q + b.q), 0.5 * (a.v + b.v)
         masses = self.system.masses(*middle, self.args)
         weights = jnp.concatenate([masses, h**2 / masses])
-        terms = action_size(self, derivative, a, h, increment)
+        terms = self.action_size(derivative, a, h, increment)
         both, work = gradient_and_work(
             derivative,
             action,
-            None if self.system.driven is None else moved,
+            None if self.system.driven is None else driven_action,
             (jnp.concatenate([a.q, a.v]), a.t),
             (jnp.concatenate([b.q, b.v]), b.t),
             weights,
             terms,
         )
-        return Drive(both[:size], both[size:] / h, work)
+        return Gradient(both[:size], both[size:] / h, work)
 
     def structure(
-        self, a: State, b: State, h: Scalar, rate: Coordinates, drive: Drive
-    ) -> Drive:
-        return Drive(b.v - a.v + drive.impulse, rate - drive.drift)
+        self, a: State, b: State, h: Scalar, rate: Coordinates, gradient: Gradient
+    ) -> tuple[Coordinates, Float[Array, " np"]]:
+        return b.v - a.v + gradient.impulse, rate - gradient.rate
 
-    def reaction(self, state: State, eta: JointMultipliers) -> Velocities:
+    def reaction_row(self, state: State, eta: JointMultipliers) -> Float[Array, " np"]:
         _, transpose = jax.vjp(lambda p: self.joint_rate(state.q, p, state.t), state.v)
         return transpose(eta)[0]
 
     def metric(self, state: State) -> Float[Array, "nq nq"]:
-        return as_dense(self.system.inertia(self.leave(state), self.args))
+        return as_dense(self.system.inertia(self.to_user(state), self.args))
 
-    def mobility(self, state: State) -> Float[Array, "nv nv"]:
+    def inverse_metric(self, state: State) -> Float[Array, "nv nv"]:
         return self.metric(state)
 
     def stiffness(
         self, state: State, multipliers: Multipliers
     ) -> tuple[Float[Array, "nq nq"], Float[Array, "nq nq"]]:
-        def energy(q: Coordinates) -> Scalar:
-            constraint = self.constraint(q, state.t)
-            return self.hamiltonian(q, state.v) + multipliers @ constraint
-
+        energy = lambda q: self.augmented_energy(State(q, state.v, state.t), multipliers)
         return jax.hessian(energy)(state.q), self.metric(state)
+
+    def augmented_energy(self, state: State, multipliers: Multipliers) -> Scalar:
+        constraint = self.constraint(state.q, state.t)
+        return self.hamiltonian(state.q, state.v) + multipliers @ constraint
+
+    def skew_gradient(
+        self,
+        middle: State,
+        multipliers: Multipliers,
+        change: tuple[Coordinates, Velocities, Time],
+        h: Scalar,
+    ) -> Gradient:
+        def action(q: Coordinates, p: Velocities, t: Time) -> Scalar:
+            return h * self.augmented_energy(State(q, p, t), multipliers)
+
+        at = middle.q, middle.v, middle.t
+        no_time = jax.tree.map(jnp.zeros_like, middle.t)
+        gradient = jax.grad(action, argnums=(0, 1, 2))
+        # Each product is with `h D`, and one factor `h` is wanted in the first part only.
+        _, (force, rate, _) = jax.jvp(gradient, at, change)
+        _, (force, rate, power) = jax.jvp(gradient, at, (rate / h, -force / h, no_time))
+        return Gradient(force, rate / h, power)
 
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
         q, p, t = state.q, state.v, state.t
@@ -152,12 +193,12 @@ class CanonicalModel(AbstractModel):
         if jacobian.shape[0] == 0:
             return -slope, jnp.zeros((0,), q.dtype)
         rates = jax.jacfwd(self.joint_rate, argnums=1)(q, p, t)
-        _, change = jax.jvp(self.joint_rate, (q, p, t), (rate, -slope, lapse_of(t)))
+        _, change = jax.jvp(self.joint_rate, (q, p, t), (rate, -slope, time_rate(t)))
         unit = 1 / self.scales.constraint
         matrix = unit[:, None] * (rates @ jacobian.T) * unit[None, :]
         balance = lambda x: unit * change - matrix @ x
-        fill = self.fill(unit.size, unit.dtype)
-        multipliers = unit * affine_root(balance, unit, fill)
+        regularisation = self.regularisation(unit.size, unit.dtype)
+        multipliers = unit * affine_root(balance, unit, regularisation)
         return -slope - multipliers @ jacobian, multipliers
 
     def multipliers(self, state: State) -> Multipliers:

@@ -1,37 +1,42 @@
-"""What an interval is described by: its unknowns and rows, its drive, their scales."""
+"""What describes an interval of a step: its unknowns, its rows, and gradients over it."""
 
+import functools
+from collections.abc import Callable
 from typing import TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._discrete import AbstractDerivative
 from .._types import Coordinates, JointMultipliers, Multipliers, Scalar
 
 
-# Of the states of a system with forces or drives; of others `None`.
+# The time of a state: a number in a system with forces or driven constraints, else `None`.
 Time: TypeAlias = Scalar | None
 
 
-def lapse_of(t: Time) -> Time:
-    """The rate of change of time."""
+def time_rate(t: Time) -> Time:
+    """The rate of change of time: one, or `None` where no time enters."""
     return None if t is None else jnp.ones_like(t)
 
 
 class Increment(eqx.Module):
     """The unknowns that lead to one node of a step, and the rows that determine them.
 
-    | field | as unknown | as row |
-    |---|---|---|
-    | `impulse` | `h lambda` | `Phi(q)/h` |
-    | `rate` | `(q - q0)/h` | balance of momentum, `S_q` |
-    | `momentum` | `p`; empty where velocities are eliminated | `S_mu/h` |
-    | `velocity_impulse` | `eta` | `psi(q, v)`; empty for index 3 |
+    | field | shape | as unknown | as row |
+    |---|---|---|---|
+    | `impulse` | `(nc,)` | `h lambda` | `Phi(q)/h` |
+    | `rate` | `(nq,)` | `(q - q0)/h` | balance of momentum, `S_q` |
+    | `momentum` | `(np,)` | `p`; empty where velocities are eliminated | `S_mu/h` |
+    | `velocity_impulse` | `(nj,)` | `eta` | `psi(q, v)`; empty for index 3 |
 
-    The rate and not `q` is the unknown: the rounding of `q`, divided by `h`, would
-    otherwise enter the velocities. Each unknown and its row have reciprocal units, so
-    one set of `Scales` serves both. The order puts those together that velocities depend
-    on: Jacobians are found for neighbouring unknowns at a time.
+    `impulse` is an energy times a time per unit of the constraint, and its row a rate of
+    change of the constraint; `rate` is a coordinate per time, and its row a generalised
+    momentum. The unknown is the rate and not `q`, because the rounding error of `q` would
+    enter the velocities divided by `h`. An unknown and its row have reciprocal units, so
+    one set of `Scales` serves both. The fields stand in the order in which velocities
+    depend on them, because Jacobians are evaluated for neighbouring unknowns at a time.
     """
 
     impulse: Multipliers
@@ -40,21 +45,25 @@ class Increment(eqx.Module):
     velocity_impulse: JointMultipliers
 
 
-class Drive(eqx.Module):
-    """What drives an interval: `h w_q`, and `w_mu` where momenta are unknowns.
+class Gradient(eqx.Module):
+    """A gradient of the energy, with its multipliers, at a state or over an interval.
 
-    `work` is `h w_t`, the work of driven constraints over it; `None` where there are none.
+    - `impulse`: `h dH/dq`, shape `(nq,)`; a generalised momentum.
+    - `rate`: `dH/dp`, shape `(np,)`, a rate of the coordinates; empty where the velocities
+      are eliminated.
+    - `work`: `h dH/dt`, an energy: the work of the driven constraints. `None` without any,
+      and in an interval in which no time passes.
     """
 
     impulse: Coordinates
-    drift: Float[Array, " np"]
+    rate: Float[Array, " np"]
     work: Scalar | None = None
 
-    def less(self, load: Coordinates | None) -> "Drive":
-        """With forces, given as `h Lm^T f`."""
+    def less(self, load: Coordinates | None) -> "Gradient":
+        """This gradient less a force, which is given as `h Lm^T f`."""
         if load is None:
             return self
-        return Drive(self.impulse - load, self.drift, self.work)
+        return Gradient(self.impulse - load, self.rate, self.work)
 
 
 class Scales(eqx.Module):
@@ -68,5 +77,54 @@ class Scales(eqx.Module):
 
     coordinate: Float[Array, " nq"]
     constraint: Float[Array, " nc"]
-    # What the constraints are differences of: their round-off, divided by eps.
+    # The size of the terms that the constraints are differences of. Times the machine
+    # epsilon it is the round-off of the constraints.
     constraint_size: Float[Array, " nc"]
+
+
+def gradient_and_work(
+    derivative: AbstractDerivative,
+    fixed: Callable[[Coordinates], Scalar],
+    driven: Callable[[Coordinates, Time], Scalar] | None,
+    a: tuple[Coordinates, Time],
+    b: tuple[Coordinates, Time],
+    weights: Coordinates | float = 1.0,
+    size: Scalar | float = 0.0,
+) -> tuple[Coordinates, Scalar | None]:
+    """The discrete gradient of `fixed(x) + driven(x, t)`, and its part in `t`.
+
+    `driven` is differenced over `x` and `t` together, so that
+
+        D . (xb - xa) + Dt (tb - ta) = driven(xb, tb) - driven(xa, ta)
+
+    Corrected forms put their correction into `Dt` alone. It is bounded there even where
+    nothing moves, and driven constraints do work through `Dt` only. What does not depend
+    on time is differenced by itself, because its own defect would otherwise be counted as
+    work of the driven constraints.
+    """
+    (xa, ta), (xb, tb) = a, b
+    gradient = functools.partial(derivative.gradient, weights=weights, size=size)
+    if driven is None:
+        return gradient(fixed, xa, xb), None
+    # The two nodes of a jump share one time variable, because no time passes in a jump.
+    if ta is tb:
+        both = lambda x: fixed(x) + driven(x, ta)
+        return gradient(both, xa, xb), None
+    with_time, work = gradient_with_time(derivative, driven, a, b)
+    return gradient(fixed, xa, xb) + with_time, work
+
+
+def gradient_with_time(
+    derivative: AbstractDerivative,
+    driven: Callable[[Coordinates, Time], Scalar],
+    a: tuple[Coordinates, Time],
+    b: tuple[Coordinates, Time],
+) -> tuple[Coordinates, Scalar]:
+    """The part in `x` and the part in `t` of the joint discrete gradient."""
+    (xa, ta), (xb, tb) = a, b
+    assert ta is not None
+    assert tb is not None
+    ends = jnp.append(xa, ta), jnp.append(xb, tb)
+    time = jnp.zeros_like(ends[0]).at[-1].set(1)
+    joint = derivative.gradient(lambda x: driven(x[:-1], x[-1]), *ends, weights=time)
+    return joint[:-1], joint[-1]

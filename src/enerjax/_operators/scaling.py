@@ -11,7 +11,6 @@ from .._system import State
 from .._types import Coordinates, Scalar
 from .base import AbstractModel
 from .interval import Increment
-from .sizes import force_size
 
 
 # What Newton may try to resolve of that round-off. It stops where corrections no longer
@@ -29,7 +28,7 @@ def scales_like(
     """
     scales = model.scales
     root = jnp.sqrt(model.energy_scale(start, h))
-    forces = jnp.abs(h) * force_size(model, start)
+    forces = jnp.abs(h) * model.force_size(start)
     # At rest the unknowns are the round-off of the rows, which is far below their floor,
     # and of the coordinates; Newton compares its corrections with their size.
     rounding = jnp.maximum(

@@ -1,15 +1,17 @@
-"""Constant inertia: velocities are eliminated by hand, and cost no unknowns.
+"""Constant inertia: the velocities are eliminated, and are no unknowns.
 
-The drive in the momenta is `M^-1` times the mean momentum, and what `psi` adds. With
-`psi = C(q) v` linear in `v` its joint difference splits without any metric between
-positions and momenta,
+The part of the discrete gradient in the momenta is `M^-1` times the mean momentum, and the
+contribution of `psi`. As `psi = C(q) v` is linear in `v`, its difference splits into a part
+in positions and one in velocities without any metric between the two,
 
     psi_b - psi_a = [D_q (C v_m)] (q_b - q_a) + 1/2 (C_a + C_b) (v_b - v_a),
 
-(with `D_q` over positions and time where constraints are driven, and `psi` affine in `v`)
-which leaves `S_mu` free of the velocities at its end but for their mean: schemes solve it
-for them.
+(with `D_q` over positions and time where constraints are driven, and `psi` affine in `v`).
+Of the velocities at the end of an interval only their mean enters `S_mu`, so the schemes
+solve that row for the velocities in closed form.
 """
+
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -17,15 +19,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._discrete import AbstractCorrected, AbstractDerivative
-from .._solvers import as_dense, Assembled, inverse_of, row_hessians, Symmetric
+from .._solvers import (
+    affine_root,
+    as_dense,
+    Assembled,
+    inverse_of,
+    product,
+    row_hessians,
+    solve,
+    Symmetric,
+)
 from .._system import AbstractKinematics, IdentityKinematics, State, System
 from .._types import Args, Coordinates, JointMultipliers, Multipliers, Scalar, Velocities
-from .balance import accelerations, multipliers
-from .base import AbstractModel
+from .base import AbstractModel, Reaction
 from .elements import element_energies, gradient_and_work_by_rows, is_weight, Summands
-from .interval import Drive, Increment, Scales, Time
-from .lapse import gradient_and_work
-from .sizes import action_size
+from .interval import Gradient, gradient_and_work, Increment, Scales, Time, time_rate
 
 
 class SeparableModel(AbstractModel):
@@ -36,7 +44,7 @@ class SeparableModel(AbstractModel):
     inertia: Symmetric
     inverse_inertia: Symmetric
     scales: Scales
-    # Asked of large systems only.
+    # Whether the potential is linear; determined for large systems only.
     is_weight: bool = eqx.field(static=True)
     kinematics: AbstractKinematics
 
@@ -57,17 +65,21 @@ class SeparableModel(AbstractModel):
     def has_canonical_rates(self) -> bool:
         return isinstance(self.kinematics, IdentityKinematics)
 
-    def enter(self, state: State) -> State:
+    def to_internal(self, state: State) -> State:
         return state
 
-    def leave(self, state: State) -> State:
+    def to_user(self, state: State) -> State:
         return State(state.q, state.v)
 
     def kinetic(self, state: State) -> Scalar:
-        return self.kinetic_of(state.v)
+        return 0.5 * state.v @ self.inertia @ state.v
 
-    def kinetic_of(self, v: Velocities) -> Scalar:
-        return 0.5 * v @ self.inertia @ v
+    def kinetic_change(self, a: State, b: State, gradient: Gradient) -> Scalar:
+        return self.kinetic(b) - self.kinetic(a)
+
+    def kinetic_of_jump(self, a: State, b: State) -> Scalar:
+        dv = b.v - a.v
+        return 0.5 * dv @ self.inertia @ dv
 
     def potential(self, state: State) -> Scalar:
         return self._potential(state.q)
@@ -78,8 +90,8 @@ class SeparableModel(AbstractModel):
     def momentum(self, state: State) -> Velocities:
         return self.inertia @ state.v
 
-    def gradient(self, state: State, h: Scalar) -> Drive:
-        return Drive(h * jax.grad(self._potential)(state.q), jnp.zeros((0,), h.dtype))
+    def gradient(self, state: State, h: Scalar) -> Gradient:
+        return Gradient(h * jax.grad(self._potential)(state.q), jnp.zeros((0,), h.dtype))
 
     def coordinate(self, q: Coordinates) -> Float[Array, " ncc"]:
         """The relations between redundant coordinates."""
@@ -99,6 +111,21 @@ class SeparableModel(AbstractModel):
     def velocity(self, state: State) -> Velocities:
         return state.v
 
+    def velocity_change(
+        self, change: Velocities, inverse_inertia: Float[Array, "nq nq"] | Symmetric
+    ) -> Velocities:
+        return change
+
+    def node_momenta(
+        self,
+        unknowns: tuple[Float[Array, " np"], ...],
+        velocities: Callable[[Reaction], tuple[Velocities, ...]],
+    ) -> tuple[Velocities, ...]:
+        return velocities(self.reaction_at)
+
+    def momentum_rows(self, rates: Velocities) -> Float[Array, " np"]:
+        return rates[:0]
+
     def push(self, qa: Coordinates, qb: Coordinates, rate: Coordinates) -> Velocities:
         return self.kinematics.push(0.5 * (qa + qb), rate, self.args)
 
@@ -112,62 +139,62 @@ class SeparableModel(AbstractModel):
         relations = jax.jacfwd(self.coordinate)
         return self.kinematics.lift(q, v, relations, self.args)
 
-    def drive(
+    def discrete_gradient(
         self,
         derivative: AbstractDerivative,
         a: State,
         b: State,
         h: Scalar,
         increment: Increment,
-    ) -> Drive:
+    ) -> Gradient:
         mean_velocity = 0.5 * (a.v + b.v)
         fixed, driven = self.split(increment)
 
-        held = lambda q: jnp.concatenate([self.fixed(q), self.coordinate(q)])
+        constraint = lambda q: jnp.concatenate([self.fixed(q), self.coordinate(q)])
         rate = lambda q: jax.jvp(self.fixed, (q,), (self.lift(q, mean_velocity),))[1]
 
         def action(q: Coordinates) -> Scalar:
             out = h * self._potential(q)
             if fixed.impulse.size > 0:
-                out = out + fixed.impulse @ held(q)
+                out = out + fixed.impulse @ constraint(q)
             if fixed.velocity_impulse.size > 0:
                 out = out + h * fixed.velocity_impulse @ rate(q)
             return out
 
-        def moved(q: Coordinates, t: Time) -> Scalar:
+        def driven_action(q: Coordinates, t: Time) -> Scalar:
             return self.driven_action(q, self.lift(q, mean_velocity), t, h, driven)
 
-        with_time = None if self.system.driven is None else moved
+        with_time = None if self.system.driven is None else driven_action
         ends, none = ((a.q, a.t), (b.q, b.t)), jnp.zeros((0,), h.dtype)
         energies = self._element_energies(a.q)
         if energies is None or not isinstance(derivative, AbstractCorrected):
-            size = action_size(self, derivative, a, h, increment)
+            size = self.action_size(derivative, a, h, increment)
             impulse, work = gradient_and_work(
                 derivative, action, with_time, *ends, size=size
             )
-            return Drive(impulse, none, work)
+            return Gradient(impulse, none, work)
         rows: list[Summands] = [lambda q, fn=fn: h * fn(q) for fn in energies]
-        rows += [lambda q: fixed.impulse * held(q)]
+        rows += [lambda q: fixed.impulse * constraint(q)]
         if fixed.velocity_impulse.size > 0:
             rows += [lambda q: h * fixed.velocity_impulse * rate(q)]
         impulse, work = gradient_and_work_by_rows(derivative, rows, with_time, *ends)
         if self.is_weight:
             impulse = impulse + h * jax.grad(self._potential)(a.q)
-        return Drive(impulse, none, work)
+        return Gradient(impulse, none, work)
 
     def structure(
-        self, a: State, b: State, h: Scalar, rate: Coordinates, drive: Drive
-    ) -> Drive:
+        self, a: State, b: State, h: Scalar, rate: Coordinates, gradient: Gradient
+    ) -> tuple[Coordinates, Float[Array, " np"]]:
         middle = 0.5 * (a.q + b.q)
         change = self._pull(middle, self.inertia @ (b.v - a.v))
         momentum = self.inertia @ (0.5 * (a.v + b.v))
         gyroscopic = self.kinematics.gyroscopic(middle, momentum, h * rate, self.args)
         if gyroscopic is not None:
             change = change + gyroscopic
-        return Drive(change + drive.impulse, drive.drift)
+        return change + gradient.impulse, gradient.rate
 
-    def reaction(self, state: State, eta: JointMultipliers) -> Velocities:
-        return self.reaction_at(state.q, state.t, eta)
+    def reaction_row(self, state: State, eta: JointMultipliers) -> Float[Array, " np"]:
+        return jnp.zeros((0,), state.q.dtype)
 
     def reaction_at(self, q: Coordinates, t: Time, eta: JointMultipliers) -> Velocities:
         """`M^-1 C(q, t)^T eta`; as `psi` is affine in `v`, the same for every `v`."""
@@ -176,12 +203,6 @@ class SeparableModel(AbstractModel):
             return rest
         _, transpose = jax.vjp(lambda v: self.joint_change(q, v, t), rest)
         return self.inverse_inertia @ transpose(eta)[0]
-
-    def mean_reaction(
-        self, qa: Coordinates, ta: Time, qb: Coordinates, tb: Time, eta: JointMultipliers
-    ) -> Velocities:
-        """`D_mu (eta . psi) = 1/2 M^-1 (C_a + C_b)^T eta`"""
-        return 0.5 * (self.reaction_at(qa, ta, eta) + self.reaction_at(qb, tb, eta))
 
     def joint_change(self, q: Coordinates, v: Velocities, t: Time) -> JointMultipliers:
         """`C(q, t) v`, the part of `psi` that is linear in `v`."""
@@ -203,7 +224,7 @@ class SeparableModel(AbstractModel):
         unit = rows / jnp.linalg.norm(rows, axis=1, keepdims=True)
         return inertia + jnp.trace(inertia) / q.size * (unit.T @ unit)
 
-    def mobility(self, state: State) -> Symmetric:
+    def inverse_metric(self, state: State) -> Symmetric:
         return self.inverse_inertia
 
     def stiffness(
@@ -211,22 +232,81 @@ class SeparableModel(AbstractModel):
     ) -> tuple[Float[Array, "nq nq"] | Assembled, Symmetric]:
         energies = self._element_energies(state.q)
         if energies is None:
-            strain = jax.hessian(lambda q: self.strain(q, state.t, multipliers))
-            return strain(state.q), as_dense(self.inertia)
+            energy = lambda q: self.augmented_energy(
+                State(q, state.v, state.t), multipliers
+            )
+            return jax.hessian(energy)(state.q), as_dense(self.inertia)
         of_constraints = lambda q: multipliers * self.constraint(q, state.t)
         fns = [*energies, of_constraints]
         return Assembled(tuple(row_hessians(fn, state.q) for fn in fns)), self.inertia
 
     def _element_energies(self, q: Coordinates) -> list[Summands] | None:
-        """All of the potential of a large system that bends, if its elements are known."""
+        """The nonlinear elements of the potential of a large system, if they are known."""
         return [] if self.is_weight else element_energies(self.system, q, self.args)
 
-    def strain(self, q: Coordinates, t: Time, multipliers: Multipliers) -> Scalar:
-        """`V + lambda . Phi`, the energy whose Hessian is the stiffness."""
-        return self._potential(q) + multipliers @ self.constraint(q, t)
+    def augmented_energy(self, state: State, multipliers: Multipliers) -> Scalar:
+        return self._potential(state.q) + multipliers @ self.constraint(state.q, state.t)
+
+    def skew_gradient(
+        self,
+        middle: State,
+        multipliers: Multipliers,
+        change: tuple[Coordinates, Velocities, Time],
+        h: Scalar,
+    ) -> Gradient:
+        _, dv, _ = change
+        no_time = jax.tree.map(jnp.zeros_like, middle.t)
+        force, power = self.stiffness_product(middle, multipliers, (dv, no_time))
+        power = None if power is None else h * power
+        return Gradient(h * force, dv[:0], power)
 
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
-        return accelerations(self, state)
+        """The constraints enter with their second derivatives in time.
+
+        Coordinate constraints have no acceleration level of their own; their multipliers
+        complete the `nq` rows of the balance of momentum.
+        """
+        q, v, t, scales = state.q, state.v, state.t, self.scales
+        qdot = self.lift(q, v)
+        slope = self.slope(state)
+        gyroscopic = self.kinematics.gyroscopic(q, self.inertia @ v, qdot, self.args)
+        if gyroscopic is not None:
+            slope = slope + gyroscopic
+        free_rate = self._free_joint_acceleration(state, qdot)
+        unit = 1 / jnp.sqrt(self.inertia.diagonal())
+
+        def conditions(x: Array) -> Array:
+            acceleration, multipliers = unit * x[: v.size], x[v.size :] / scales.constraint
+            # Evaluated in here, because the sparsity pattern of the conditions is found
+            # from indices that are constants of this function.
+            pulled = self.pull(q, q, self.inertia @ acceleration)
+            pulled = pulled + self.constraint_force(q, t, multipliers)
+            rate = self.joint_change(q, acceleration, t) + free_rate
+            rows = (
+                (pulled + slope) / scales.coordinate,
+                rate / scales.constraint[: rate.size],
+            )
+            return jnp.concatenate(rows)
+
+        count = scales.constraint.size
+        like = jnp.zeros((v.size + count,), q.dtype)
+        x = affine_root(conditions, like, self.regularisation_after(v, count))
+        return unit * x[: v.size], x[v.size :] / scales.constraint
 
     def multipliers(self, state: State) -> Multipliers:
-        return multipliers(self, state)
+        """By the constraints alone where `L = I`, which needs a smaller matrix."""
+        inverse_inertia = self.inverse_inertia
+        is_plain = self.has_canonical_rates and isinstance(inverse_inertia, Array)
+        if not is_plain or self.system.redundant:
+            return self.accelerations(state)[1]
+        rows = jax.jacfwd(self.constraint)(state.q, state.t)
+        rows = rows / self.scales.constraint[:, None]
+        free = inverse_inertia @ self.slope(state)
+        right = self._free_joint_acceleration(state, state.v) / self.scales.constraint
+        matrix = product(product(rows, inverse_inertia), rows.T)
+        return solve(matrix, right - rows @ free) / self.scales.constraint
+
+    def _free_joint_acceleration(self, state: State, qdot: Coordinates) -> JointMultipliers:
+        """`dpsi/dt` in a motion with constant velocities `v`."""
+        rates = lambda q, t: self.joint_rate(q, state.v, t)
+        return jax.jvp(rates, (state.q, state.t), (qdot, time_rate(state.t)))[1]

@@ -14,7 +14,7 @@ from .._results import RESULTS
 from .._solvers import ROOT
 from .._system import State
 from .._types import Count, Flag, Real, Scalar
-from ..schemes import AbstractCarryingSolve, AbstractScheme
+from ..schemes import AbstractScheme, AbstractSchemeWithMemory
 from .collocation import end_of, Pair, rates, rates_along
 from .prediction import for_length, with_history
 from .step import StepOutput, Warm
@@ -67,7 +67,7 @@ class StepController(AbstractController):
     def plan(
         self, scheme: AbstractScheme, h: Scalar, t0: Scalar, end: End
     ) -> "_ControlledPlan":
-        if isinstance(scheme.stage, AbstractCarryingSolve):
+        if isinstance(scheme.stage, AbstractSchemeWithMemory):
             raise ValueError(
                 f"`{type(scheme).__name__}` carries an acceleration from step to step that "
                 "belongs to one length of the steps, so no `controller` can vary it. Give "

@@ -17,7 +17,7 @@ from .._results import RESULTS
 from .._solvers import RootFinder
 from .._system import State
 from .._types import Count, Flag, Scalar
-from ..schemes import AbstractSingleSolve, StepEnd
+from ..schemes import AbstractOneSolveScheme, StepEnd
 from .stage import first_memory, Memory, solve, Solved
 
 
@@ -26,7 +26,7 @@ _HALVINGS_OF_LARGE_SYSTEMS = 3
 
 
 def solve_or_divide(
-    scheme: AbstractSingleSolve,
+    scheme: AbstractOneSolveScheme,
     model: AbstractModel,
     start: State,
     h: Scalar,
@@ -71,7 +71,7 @@ def solve_or_divide(
 
 
 def _in_parts(
-    scheme: AbstractSingleSolve,
+    scheme: AbstractOneSolveScheme,
     model: AbstractModel,
     start: State,
     h: Scalar,
@@ -94,21 +94,20 @@ def _in_parts(
 
     none = jax.tree.map(jnp.zeros_like, before.end)
     nothing = StepEnd(
-        State(start.q, start.v, before.end.state.t),
-        none.displacement,
-        none.multipliers,
-        none.energies,
-        before.end.details,
-        RESULTS.successful,
-        before.end.carried,
+        state=State(start.q, start.v, before.end.state.t),
+        displacement=none.displacement,
+        multipliers=none.multipliers,
+        energies=none.energies,
+        details=before.end.details,
+        carried=before.end.carried,
     )
     first = Solved(
-        nothing,
-        before.iterations,
-        before.residual,
-        RESULTS.successful,
-        before.roughness,
-        begin(start, length),
+        end=nothing,
+        iterations=before.iterations,
+        residual=before.residual,
+        result=RESULTS.successful,
+        roughness=before.roughness,
+        memory=begin(start, length),
     )
     done, _ = jax.lax.scan(part, first, jnp.arange(most, dtype=h.dtype))
     state = _timed(done.end.state, start, h)
@@ -123,17 +122,23 @@ def _timed(state: State, start: State, passed: Scalar) -> State:
 def _joined(a: Solved, b: Solved, parts: Scalar) -> Solved:
     """What one part adds to those before it."""
     end = StepEnd(
-        b.end.state,
-        a.end.displacement + b.end.displacement,
+        state=b.end.state,
+        displacement=a.end.displacement + b.end.displacement,
         # The mean force over the step.
-        a.end.multipliers + b.end.multipliers / parts,
-        jax.tree.map(jnp.add, a.end.energies, b.end.energies),
-        b.end.details,
-        b.end.result,
-        b.end.carried,
+        multipliers=a.end.multipliers + b.end.multipliers / parts,
+        energies=jax.tree.map(jnp.add, a.end.energies, b.end.energies),
+        details=b.end.details,
+        result=b.end.result,
+        carried=b.end.carried,
     )
-    made = a.iterations + b.iterations
-    return Solved(end, made, b.residual, b.result, b.roughness, b.memory)
+    return Solved(
+        end=end,
+        iterations=a.iterations + b.iterations,
+        residual=b.residual,
+        result=b.result,
+        roughness=b.roughness,
+        memory=b.memory,
+    )
 
 
 def _select(choice: Flag, yes: Any, no: Any) -> Any:

@@ -130,7 +130,7 @@ def _run(task: _Task) -> tuple[Solution, Scalar]:
 
     def observe(state: State, t: Scalar) -> tuple[PyTree[Any], Measures]:
         """What users are given of a state, and what the audit tells of it."""
-        told: PyTree[Any] = model.leave(state)
+        told: PyTree[Any] = model.to_user(state)
         if fn is not None:
             told = jax.tree.map(jnp.asarray, fn(t, told, task.args))
         timed = State(state.q, state.v, t if task.system.is_timed else None)
@@ -150,7 +150,7 @@ def _run(task: _Task) -> tuple[Solution, Scalar]:
         root_finder=task.root_finder,
         max_halvings=task.max_halvings,
     )
-    start = model.enter(task.start)
+    start = model.to_internal(task.start)
     begin, end, record = run_loop(stepper, start, saving.steps_in_group(plan), keep)
     rows = saving.rows(model, plan, begin, record, end.completed, task.scheme.order)
     ys, told = rows.kept if at_once else jax.vmap(observe)(rows.kept, rows.ts)
@@ -168,7 +168,7 @@ def _run(task: _Task) -> tuple[Solution, Scalar]:
             completed_steps=end.completed,
             rejected_steps=plan.num_rejected(end.memory),
         ),
-        end=model.leave(end.state),
+        end=model.to_user(end.state),
         result=end.result,
     )
     return solution, plan.time(end.place)

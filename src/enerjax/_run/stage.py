@@ -25,10 +25,10 @@ from .._solvers import (
 from .._system import State
 from .._types import Count, Flag, Multipliers, Scalar, Velocities
 from ..schemes import (
-    AbstractCarryingSolve,
-    AbstractSimplifiedSolve,
-    AbstractSingleSolve,
+    AbstractOneSolveScheme,
+    AbstractSchemeWithMemory,
     StepEnd,
+    StepProblem,
 )
 
 
@@ -73,7 +73,7 @@ class Solved(eqx.Module):
 
 
 def first_memory(
-    scheme: AbstractSingleSolve,
+    scheme: AbstractOneSolveScheme,
     model: AbstractModel,
     start: State,
     h: Scalar,
@@ -82,7 +82,7 @@ def first_memory(
 ) -> Memory:
     """The memory of a run that begins."""
     carried = None
-    if isinstance(scheme, AbstractCarryingSolve):
+    if isinstance(scheme, AbstractSchemeWithMemory):
         carried = scheme.begin(model, start, h, acceleration)
     problem = _problem(scheme, model, start, h, carried)
     z = scheme.predict(problem, acceleration, multipliers)
@@ -96,7 +96,7 @@ def first_memory(
 
 
 def _problem(
-    scheme: AbstractSingleSolve,
+    scheme: AbstractOneSolveScheme,
     model: AbstractModel,
     start: State,
     h: Scalar,
@@ -104,13 +104,13 @@ def _problem(
 ) -> Any:
     """The data of a step."""
     problem = scheme.problem(model, start, h)
-    if isinstance(scheme, AbstractCarryingSolve):
+    if isinstance(scheme, AbstractSchemeWithMemory):
         return scheme.resume(problem, carried)
     return problem
 
 
 def solve(
-    scheme: AbstractSingleSolve,
+    scheme: AbstractOneSolveScheme,
     model: AbstractModel,
     start: State,
     h: Scalar,
@@ -128,13 +128,13 @@ def solve(
         z = jax.tree.map(jnp.multiply, x, unknown_scale)
         return jax.tree.map(jnp.divide, scheme.residual(z, problem), row_scale)
 
-    def simplified(x, held, inputs):
-        scheme, problem, unknown_scale, row_scale = inputs
-        assert isinstance(scheme, AbstractSimplifiedSolve)
-        z, held = (jax.tree.map(jnp.multiply, x, unknown_scale) for x in (x, held))
-        rows = scheme.simplified(z, held, problem)
-        return jax.tree.map(jnp.divide, rows, row_scale)
+    def scaled_with_weak_couplings_held(x, inputs):
+        scheme, problem, *scales = inputs
+        return scaled(x, (scheme, problem.with_weak_couplings_held(), *scales))
 
+    has_weak_couplings = (
+        isinstance(problem, StepProblem) and problem.weak_couplings == "exact"
+    )
     inputs = (scheme, problem, unknown_scale, row_scale)
 
     guess = jax.tree.map(
@@ -152,9 +152,9 @@ def solve(
         others=[scale_down(shortened(flight, part)) for part in (1.0, 0.5, 0.25)],
         factors=jax.tree.map(_next, memory.factors),
         skip=skip,
-        fill=_fill(model, unknown_scale, row_scale),
+        regularisation=_regularisation(model, unknown_scale, row_scale),
         least=least,
-        simplified=simplified if isinstance(scheme, AbstractSimplifiedSolve) else None,
+        jacobian_of=scaled_with_weak_couplings_held if has_weak_couplings else None,
     )
     z = jax.tree.map(jnp.multiply, root.value, unknown_scale)
     end = scheme.finish(z, problem)
@@ -240,7 +240,7 @@ def _with_multipliers(z: PyTree[Any], values: PyTree[Any]) -> PyTree[Any]:
     return jax.tree.map(change, z, values, is_leaf=is_increment)
 
 
-def _fill(model: AbstractModel, unknown_scale: Any, row_scale: Any) -> Any | None:
+def _regularisation(model: AbstractModel, unknown_scale: Any, row_scale: Any) -> Any | None:
     """What makes the step equations regular where constraints repeat each other.
 
     Weighed by the scales of row and unknown, so that the multipliers of least norm are
@@ -252,14 +252,14 @@ def _fill(model: AbstractModel, unknown_scale: Any, row_scale: Any) -> Any | Non
     def weigh(unit: Array, row: Array) -> Array:
         product = unit * row
         share = jnp.min(product, initial=jnp.inf) / product
-        return share * jnp.asarray(model.fill(unit.size, unit.dtype))
+        return share * jnp.asarray(model.regularisation(unit.size, unit.dtype))
 
     none = jax.tree.map(jnp.zeros_like, unknown_scale)
     return _with_multipliers(none, jax.tree.map(weigh, unknown_scale, row_scale))
 
 
 def _free_flight(
-    scheme: AbstractSingleSolve, problem: Any, model: AbstractModel, start: State
+    scheme: AbstractOneSolveScheme, problem: Any, model: AbstractModel, start: State
 ) -> PyTree[Any]:
     """The unknowns of a step in which no force acts."""
     num_constraints = jax.eval_shape(model.constraint, start.q, start.t).shape[0]

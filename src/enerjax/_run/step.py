@@ -148,7 +148,7 @@ def _sum_and_rest(x: Array, y: Array) -> tuple[Array, Array]:
 @eqx.filter_jit
 def _single_step(system, scheme, state, args, h, warm, root_finder, max_halvings):
     model = make_model(system, state, args)
-    state = model.enter(state)
+    state = model.to_internal(state)
     fresh = lambda: first_warm(scheme, model, state, h, *model.accelerations(state))
     if warm is None:
         warm = fresh()
@@ -160,7 +160,7 @@ def _single_step(system, scheme, state, args, h, warm, root_finder, max_halvings
     no = jnp.array(False)
     go = lambda: advance(scheme, model, state, h, warm, root_finder, no, max_halvings)
     out = in_one_function(go)()
-    return eqx.tree_at(lambda out: out.state, out, model.leave(out.state))
+    return eqx.tree_at(lambda out: out.state, out, model.to_user(out.state))
 
 
 def _kinds(tree: PyTree[Any]) -> Any:

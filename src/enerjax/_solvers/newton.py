@@ -67,8 +67,8 @@ class Start(eqx.Module):
       without.
     - `factors`: of the Jacobian of the solve before, where it is kept.
     - `skip`: return the guess without an iteration.
-    - `fill`: for each unknown, what is added to the diagonal of a Jacobian that may be
-      singular; see `find_root`.
+    - `regularisation`: for each unknown, what is added to the diagonal of a Jacobian that
+      may be singular; see `find_root`.
     - `least`: where all unknowns are smaller, it is by round-off.
     """
 
@@ -76,5 +76,5 @@ class Start(eqx.Module):
     others: tuple[PyTree[Array], ...]
     factors: AbstractFactors | None
     skip: Flag
-    fill: PyTree[Array] | None
+    regularisation: PyTree[Array] | None
     least: Scalar

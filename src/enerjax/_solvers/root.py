@@ -28,16 +28,16 @@ ROOT = "enerjax_root"
 
 
 @eqx.filter_custom_jvp
-def _root(fn, simplified, root_finder, args, start, max_iterations):
-    return search(fn, simplified, root_finder, args, start, max_iterations)
+def _root(fn, jacobian_of, root_finder, args, start, max_iterations):
+    return search(fn, jacobian_of, root_finder, args, start, max_iterations)
 
 
 @_root.def_jvp
 def _root_jvp(primals, tangents):
-    fn, simplified, root_finder, args, start, max_iterations = primals
+    fn, jacobian_of, root_finder, args, start, max_iterations = primals
     t_args = tangents[3]
     # Apart: derivatives neither trace nor need how it is found.
-    again = lambda: _root(fn, simplified, root_finder, args, start, max_iterations)
+    again = lambda: _root(fn, jacobian_of, root_finder, args, start, max_iterations)
     root = in_one_function(again)()
     # All that the derivatives of a step need of the search for it.
     root = eqx.tree_at(
@@ -52,10 +52,10 @@ def _root_jvp(primals, tangents):
     by_args = lambda moved: flat_fn(flat, eqx.combine(moved, fixed))
     _, rate = jax.jvp(by_args, (moved,), (t_args,))
     given = root_finder.linear_solver if isinstance(root_finder, Newton) else None
-    fill = flat_of(args[-1])
-    linear = linearisable(flat_fn, flat, args, given, fill)
+    regularisation = flat_of(args[-1])
+    linear = linearisable(flat_fn, flat, args, given, regularisation)
     change = linear.solve(flat, -rate)
-    if fill is not None:
+    if regularisation is not None:
         change = change + _turned(linear, flat_fn, flat, (moved, fixed), t_args)
     # Nothing but the root itself depends on the arguments: not how it was found.
     still = jax.tree.map(jnp.zeros_like, eqx.filter(root, eqx.is_inexact_array))
@@ -71,9 +71,9 @@ def _turned(
 ) -> Float[Array, " n"]:
     """How fast a root of least size moves into what the equations leave open.
 
-    That turns with the arguments, and the root stays orthogonal to it. It is the limit of
-    the roots `r` of `fn(r) + fill r = 0` for a fill that vanishes; their derivatives show
-    this part at `r`, one correction off, and not at the root.
+    That part turns with the arguments, and the root stays orthogonal to it. The root is the
+    limit of the roots `r` of `fn(r) + regularisation r = 0` as the regularisation vanishes.
+    Their derivatives show this part at `r`, which is one correction off the root.
     """
     moved, fixed = parts
 
@@ -81,11 +81,11 @@ def _turned(
         args = eqx.combine(moved, fixed)
         return fn(at, args) + ravel_pytree(args[-1])[0] * at
 
-    assert linear.fill is not None
-    solve = linear.filled_solver(root)
-    regular = root - solve(linear.fill * root)
+    assert linear.regularisation is not None
+    solve = linear.regularised_solver(root)
+    regular = root - solve(linear.regularisation * root)
     _, rate = jax.jvp(lambda moved: filled(moved, regular), (moved,), (t_args,))
-    return linear.open_part(solve, linear.filled_solver(regular)(-rate))
+    return linear.open_part(solve, linear.regularised_solver(regular)(-rate))
 
 
 def find_root(
@@ -98,28 +98,28 @@ def find_root(
     others: Sequence[PyTree[Array]] = (),
     factors: AbstractFactors | None = None,
     skip: Flag | bool = False,
-    fill: PyTree[Array] | None = None,
+    regularisation: PyTree[Array] | None = None,
     least: Scalar | float = 1.0,
-    simplified: Callable[[PyTree[Array], PyTree[Array], Any], PyTree[Array]] | None = None,
+    jacobian_of: Callable[[PyTree[Array], Any], PyTree[Array]] | None = None,
 ) -> Root:
     """The root of `fn(y, args)`. Never raises.
 
     The implicit function theorem gives its derivatives with respect to `args`, with one
-    linear solve each; a singular lane of a batch has non-finite derivatives of its own and
-    leaves the others alone. `guess`, `factors` (of a solve before) and `others`,
-    guesses that
-    `Newton` turns to where it fails, only say where to begin. With `skip`, `Newton`
+    linear solve each. A singular lane of a batch has non-finite derivatives of its own and
+    leaves the others alone. `guess`, `factors` (of a solve before) and `others` (guesses
+    that `Newton` turns to if it fails) only say where to begin. With `skip`, `Newton`
     returns the guess without an iteration.
 
-    `fill` is for equations that do not determine some of the unknowns, and do not ask for
-    them either: small numbers that are added to the diagonal of the Jacobian, and make it
-    regular. Of all roots it is then the one of least size that is found, in the norm that
-    `fill` weights, with its derivatives. Unknowns that turn out all smaller than one are
-    resolved by their own size, down to `least`.
+    `regularisation` is for equations that leave a combination of the unknowns open: small
+    numbers that are added to the diagonal of the Jacobian and make it regular. The root is
+    then the one of least size, in the norm that `regularisation` weights, and so are its
+    derivatives. If all unknowns turn out smaller than one, they are resolved relative to
+    their own size, down to `least`.
 
-    `simplified(y, held, args)` equals `fn` where `held` is `y`. Where its Jacobian in `y`
-    is a narrower band, `Newton` searches with that, and with the exact one only where that
-    search has failed.
+    `jacobian_of(y, args)` is a function whose Jacobian approximates that of `fn`, for
+    example `fn` with `jax.lax.stop_gradient` around weak couplings. Where it is a narrower
+    band, `Newton` searches with it, and with the exact Jacobian only where that search has
+    failed. The root and its derivatives are those of `fn` in any case.
     """
     flat, _ = ravel_pytree(guess)
     start = Start(
@@ -127,18 +127,18 @@ def find_root(
         tuple(others),
         kept_factors(flat.size, flat.dtype) if factors is None else factors,
         jnp.asarray(skip),
-        fill,
+        regularisation,
         jnp.asarray(least, flat.dtype),
     )
     start = jax.lax.stop_gradient(start)
     traced, opened = _opened(fn, guess, args)
     call = lambda y, inputs: opened(inputs[0], y, inputs[1])
-    near, traced_too = None, None
-    if simplified is not None and flat.size > LARGE:
-        traced_too, opened_too = _opened(simplified, guess, guess, args)
-        near = lambda y, held, inputs: opened_too(inputs[2], y, held, inputs[1])
-    inputs = traced, args, traced_too, fill
-    return _root(call, near, root_finder, inputs, start, max_iterations)
+    narrow, traced_too = None, None
+    if jacobian_of is not None and flat.size > LARGE:
+        traced_too, opened_too = _opened(jacobian_of, guess, args)
+        narrow = lambda y, inputs: opened_too(inputs[2], y, inputs[1])
+    inputs = traced, args, traced_too, regularisation
+    return _root(call, narrow, root_finder, inputs, start, max_iterations)
 
 
 def _opened(fn: Callable, *like: Any) -> tuple[Any, Callable]:

@@ -47,13 +47,13 @@ def flattened(fn: Callable, value: PyTree[Array]) -> tuple[Array, Callable, Call
     return flat, unravel, lambda x, args: ravel_pytree(fn(unravel(x), args))[0]
 
 
-def flat_of(fill: PyTree[Array] | None) -> Array | None:
-    return None if fill is None else ravel_pytree(fill)[0]
+def flat_of(regularisation: PyTree[Array] | None) -> Array | None:
+    return None if regularisation is None else ravel_pytree(regularisation)[0]
 
 
 def search(
     fn: Callable[[PyTree[Array], Any], PyTree[Array]],
-    simplified: Callable[[PyTree[Array], PyTree[Array], Any], PyTree[Array]] | None,
+    jacobian_of: Callable[[PyTree[Array], Any], PyTree[Array]] | None,
     root_finder: RootFinder,
     args: PyTree,
     start: Start,
@@ -80,25 +80,23 @@ def search(
             singular | nonfinite,
             jnp.isfinite(residual),
         )
-    flat, unravel, flat_fn = flattened(fn, start.guess)
-    given, fill = root_finder.linear_solver, flat_of(start.fill)
-    exact, near = linearisable(flat_fn, flat, args, given, fill), None
-    if simplified is not None and given is None:
-        flat_simplified = lambda x, inputs: ravel_pytree(
-            simplified(unravel(x), unravel(inputs[0]), inputs[1])
-        )[0]
-        near = narrowed(exact, flat_simplified, flat, args)
-    if near is None:
+    flat, _, flat_fn = flattened(fn, start.guess)
+    given, regularisation = root_finder.linear_solver, flat_of(start.regularisation)
+    exact, narrow = linearisable(flat_fn, flat, args, given, regularisation), None
+    if jacobian_of is not None and given is None:
+        _, _, flat_jacobian_of = flattened(jacobian_of, start.guess)
+        narrow = narrowed(exact, flat_jacobian_of, flat, args)
+    if narrow is None:
         return _iterated(exact, root_finder, start, max_iterations)
     alone = eqx.tree_at(lambda start: start.others, start, ())
-    first = _iterated(near, root_finder, alone, PATIENCE)
+    first = _iterated(narrow, root_finder, alone, PATIENCE)
 
     def again() -> Root:
         # (The lanes of a batch all come here.)
         left = eqx.tree_at(lambda start: start.skip, start, start.skip | first.found)
         last = _iterated(exact, root_finder, left, max_iterations)
-        made = first.iterations + last.iterations
-        return eqx.tree_at(lambda root: root.iterations, last, made)
+        total = first.iterations + last.iterations
+        return eqx.tree_at(lambda root: root.iterations, last, total)
 
     return jax.lax.cond(first.found, lambda: first, again)
 
@@ -109,7 +107,7 @@ def _iterated(
     _, unravel = ravel_pytree(start.guess)
     last = newton_iterations(residual, newton, start, max_jacobians)
     x = last.x
-    if residual.fill is not None:
+    if residual.regularisation is not None:
         x = jnp.where(last.done & ~start.skip, _least(residual, last.factors, x), x)
     keeps = residual.keeps_factors and start.factors is not None
     factors = last.factors if keeps else start.factors
@@ -129,7 +127,8 @@ def _least(
 ) -> Float[Array, " n"]:
     """The root of least size, from one with a part that the equations leave open.
 
-    By the Jacobian at the root: what another one is off by is divided by the fill.
+    The Jacobian must be the one at the root: the regularisation is small, and the error of
+    any other is divided by it.
     """
     matrix = residual.jacobian(x)
     once = factors.renewed(matrix).solve

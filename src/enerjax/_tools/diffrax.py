@@ -26,7 +26,7 @@ class IndexReduced(eqx.Module):
 
     def state(self, t: Real, y: tuple[Coordinates, Velocities]) -> State:
         """The `State` that `y` stands for."""
-        return self.model.leave(self._inner(t, y))
+        return self.model.to_user(self._inner(t, y))
 
     def multipliers(self, t: Real, y: tuple[Coordinates, Velocities]) -> Multipliers:
         """`lambda`, shape `(nc,)`, that holds the constraints there."""
@@ -77,5 +77,5 @@ def to_diffrax(
         ) from error
     start, args = check_system(system, start, args, t0)
     model = make_model(system, start, args)
-    begin = model.enter(start)
+    begin = model.to_internal(start)
     return diffrax.ODETerm(IndexReduced(model)), (begin.q, begin.v)

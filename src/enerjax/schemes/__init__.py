@@ -1,13 +1,28 @@
+"""The time integration schemes, and what a scheme of your own is written with.
+
+A scheme of your own subclasses `AbstractOneSolveScheme`; `docs/write-your-own-scheme.md`
+shows one from its equations to its tests.
+"""
+
+from .._operators import (
+    AbstractModel as AbstractModel,
+    Gradient as Gradient,
+    Increment as Increment,
+    Reaction as Reaction,
+)
+from .._results import RESULTS as RESULTS
 from .base import (
-    AbstractCarryingSolve as AbstractCarryingSolve,
+    AbstractOneSolveScheme as AbstractOneSolveScheme,
     AbstractScheme as AbstractScheme,
-    AbstractSimplifiedSolve as AbstractSimplifiedSolve,
-    AbstractSingleSolve as AbstractSingleSolve,
+    AbstractSchemeWithMemory as AbstractSchemeWithMemory,
+    Energies as Energies,
+    ForceLaw as ForceLaw,
+    Formulation as Formulation,
+    Node as Node,
     StepEnd as StepEnd,
     StepProblem as StepProblem,
 )
 from .composed import Composed as Composed
-from .energies import Energies as Energies
 from .energy_consistent import EnergyConsistent as EnergyConsistent
 from .energy_decaying import EnergyDecaying as EnergyDecaying
 from .energy_preserving import EnergyPreserving as EnergyPreserving

@@ -1,72 +1,209 @@
+"""What a scheme is, and the data, the rows and the end of one of its steps."""
+
 import abc
+import dataclasses
 from collections.abc import Callable
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import PyTree
+from jaxtyping import Array, Float, PyTree
 
-from .._discrete import AbstractDerivative
-from .._operators import AbstractModel, Drive, Increment, Time
+from .._discrete import AbstractDerivative, ChainRule
+from .._operators import (
+    AbstractModel,
+    Gradient,
+    Increment,
+    Reaction,
+    SeparableModel,
+    Time,
+)
 from .._results import RESULTS
 from .._system import State
 from .._types import Coordinates, JointMultipliers, Multipliers, Scalar, Velocities
-from .energies import Energies
 
 
-# The levels at which joints are held: positions and velocities, stabilised as by Gear,
+# The levels at which joints are imposed: positions and velocities, stabilised as by Gear,
 # Gupta and Leimkuhler; or positions only.
 Formulation: TypeAlias = Literal["ggl", "index3"]
-# A force as a function of coordinates, velocities and time: all of it, or a part.
-Law: TypeAlias = Callable[[Coordinates, Velocities, Time], Velocities]
+# A force law `f(q, v, t)`, the whole force of a system or a part of it.
+ForceLaw: TypeAlias = Callable[[Coordinates, Velocities, Time], Velocities]
 Z = TypeVar("Z")
 P = TypeVar("P")
 
 
+class Energies(eqx.Module):
+    """The energy account of a step, or of the steps since the row before.
+
+    - `dissipated`: removed by the scheme, by its own identity.
+    - `work`: of the forces, dampers included.
+    - `damped`: taken by dampers: `-work` of the part of the forces that changes sign with
+      the velocity.
+    - `drive_work`: of the driven constraints.
+
+    All are energies: scalars in a step, with a leading axis of rows in a solution. `None`
+    where the system has no forces, or no driven constraints. With them
+
+        E1 = E0 - dissipated + work + drive_work
+    """
+
+    dissipated: Float[Array, "..."]
+    work: Float[Array, "..."] | None
+    damped: Float[Array, "..."] | None
+    drive_work: Float[Array, "..."] | None
+
+
+class Node(eqx.Module):
+    """A node of a step, as each part of the step equations sees it.
+
+    The three states have the same values. They differ only while weak couplings are held,
+    and then only in their derivatives; see `StepProblem`.
+
+    - `state`: for the balance of momentum and the constraints.
+    - `in_gradient`: for the discrete gradient.
+    - `in_joint_rate`: for the constraints at velocity level.
+    """
+
+    state: State
+    in_gradient: State
+    in_joint_rate: State
+
+
 class StepProblem(eqx.Module):
-    """Everything that is known when a step starts."""
+    """Everything that is known when a step starts.
+
+    - `model`: the system with its `args`.
+    - `start`: the state at the start, as the model has it: in `v` velocities, or momenta.
+    - `h`: the length of the step, a scalar (time); negative in a backward stage.
+    - `derivative`: the discrete gradient; schemes that take none leave the default.
+    - `formulation`: the levels at which joints are imposed, `"ggl"` or `"index3"`.
+    - `weak_couplings`: whether the reaction `M^-1 C^T eta` in the velocities is
+      differentiated. It couples a body with the neighbours of its neighbours, but weakly,
+      because `eta` is small; without it the Jacobian of a large system is a narrower band.
+      `"absent"`: the scheme has no such coupling, or makes no use of this. `"exact"`: all
+      is differentiated. `"held"`: `jax.lax.stop_gradient` is applied to `C` in the
+      velocity-level constraints and to the whole reaction in the discrete gradient, where
+      it has a factor `eta`. Values are the same, and a search that converges with such a
+      Jacobian finds the same root.
+    """
 
     model: AbstractModel
     start: State
     h: Scalar
-    derivative: AbstractDerivative
-    formulation: Formulation = eqx.field(static=True)
+    derivative: AbstractDerivative = ChainRule()
+    formulation: Formulation = eqx.field(default="ggl", static=True)
+    weak_couplings: Literal["absent", "exact", "held"] = eqx.field(
+        default="absent", static=True
+    )
+
+    @classmethod
+    def with_constant_inertia(
+        cls,
+        scheme: str,
+        model: AbstractModel,
+        start: State,
+        h: Scalar,
+        formulation: Formulation = "ggl",
+    ) -> "StepProblem":
+        """A problem for schemes that need constant inertia and `v = qdot`.
+
+        Raises a `ValueError`, which names the `scheme`, for any other system.
+        """
+        if model.has_canonical_rates and not model.has_own_momenta:
+            return cls(model, start, h, formulation=formulation)
+        has = "`kinematics`"
+        if model.has_own_momenta:
+            has = "varying inertia or a Hamiltonian"
+        raise ValueError(
+            f"`{scheme}` needs constant inertia and velocities that are the rates of the "
+            f"coordinates, and this system has {has}. Use `EnergyPreserving` or "
+            "`EnergyDecaying`, or compare on points, directors (`bodies.RigidBody`) or "
+            "planar bodies."
+        )
+
+    def with_weak_couplings_held(self) -> "StepProblem":
+        """The same problem for the Jacobians of a search."""
+        return dataclasses.replace(self, weak_couplings="held")
 
     @property
-    def lapse(self) -> Time:
-        """The time that passes, where time enters."""
+    def separable_model(self) -> SeparableModel:
+        """The model of a problem that was made by `with_constant_inertia`."""
+        assert isinstance(self.model, SeparableModel)
+        return self.model
+
+    @property
+    def duration(self) -> Time:
+        """`h` where time enters the system, else `None`."""
         return None if self.start.t is None else self.h
 
     @property
     def end_time(self) -> Time:
+        """The time at the end of the step, where time enters, else `None`."""
         return None if self.start.t is None else self.start.t + self.h
 
     @property
     def middle_time(self) -> Time:
+        """The time in the middle of the step, where time enters, else `None`."""
         return None if self.start.t is None else self.start.t + 0.5 * self.h
 
-    def at(self, increment: Increment) -> Coordinates:
-        """The configuration that an increment leads to."""
+    def position(self, increment: Increment) -> Coordinates:
+        """The coordinates at the node that an increment leads to, shape `(nq,)`."""
         return self.start.q + self.h * increment.rate
 
-    def node(self, increment: Increment, t: Time) -> State:
-        """The state that an increment leads to, where momenta are unknowns."""
-        return State(self.at(increment), increment.momentum, t)
+    def velocity(self, end: Increment) -> Velocities:
+        """`Lm (q1 - q0)/h`: the velocity without what multipliers add to it."""
+        return self.model.push(self.start.q, self.position(end), end.rate)
 
-    def drive(self, a: State, b: State, increment: Increment) -> Drive:
-        """The discrete gradient over `a -> b`."""
-        return self.model.drive(self.derivative, a, b, self.h, increment)
+    def nodes(
+        self,
+        velocities: Callable[[Reaction], tuple[Velocities, ...]],
+        *ends: tuple[Increment, Time],
+    ) -> tuple[Node, ...]:
+        """The nodes that increments lead to, each given with its time.
+
+        `velocities(reaction)` returns the velocities at the nodes, solved from the rows
+        `S_mu`, where `reaction(q, t, eta)` is `M^-1 C(q, t)^T eta`. It is not called where
+        momenta are unknowns.
+        """
+        model, hold = self.model, jax.lax.stop_gradient
+        momenta = tuple(z.momentum for z, _ in ends)
+
+        def states(change: Callable[[Reaction], Reaction]) -> list[State]:
+            found = model.node_momenta(
+                momenta, lambda reaction: velocities(change(reaction))
+            )
+            return [
+                State(self.position(z), v, t) for (z, t), v in zip(ends, found, strict=True)
+            ]
+
+        exact = states(lambda reaction: reaction)
+        if self.weak_couplings != "held":
+            return tuple(Node(state, state, state) for state in exact)
+        gradients_held = states(
+            lambda reaction: lambda q, t, eta: reaction(hold(q), t, eta)
+        )
+        all_held = states(lambda reaction: lambda q, t, eta: hold(reaction(q, t, eta)))
+        return tuple(map(Node, exact, all_held, gradients_held))
+
+    def discrete_gradient(self, a: State, b: State, increment: Increment) -> Gradient:
+        """The discrete gradient over `a -> b` with the multipliers of `increment`."""
+        return self.model.discrete_gradient(self.derivative, a, b, self.h, increment)
 
     def drive_work(self, a: State, b: State, increment: Increment) -> Scalar | None:
         """The work of the driven constraints over `a -> b`; `None` without any."""
         if self.model.system.driven is None:
             return None
-        return self.drive(a, b, increment).work
+        return self.discrete_gradient(a, b, increment).work
 
-    def velocity(self, end: Increment) -> Velocities:
-        """`Lm (q1 - q0)/h`: free of what multipliers add to velocities."""
-        return self.model.push(self.start.q, self.at(end), end.rate)
+    def load(
+        self, law: ForceLaw, a: State, b: State, end: Increment, velocity: Velocities
+    ) -> Coordinates:
+        """`h Lm^T f` in the middle of `a -> b`, with `Lm` that of the step to `end`."""
+        assert a.t is not None
+        assert b.t is not None
+        force = law(0.5 * (a.q + b.q), velocity, 0.5 * (a.t + b.t))
+        return self.h * self.model.pull(self.start.q, self.position(end), force)
 
     def step_load(self, b: State, end: Increment) -> Coordinates | None:
         """`h Lm^T f` in the middle of the step; `None` for a system without forces."""
@@ -74,22 +211,16 @@ class StepProblem(eqx.Module):
             return None
         return self.load(self.model.force, self.start, b, end, self.velocity(end))
 
-    def load(
-        self, law: Law, a: State, b: State, end: Increment, velocity: Velocities
-    ) -> Coordinates:
-        """`h Lm^T f` in the middle of `a -> b`, with `Lm` that of the step to `end`."""
-        assert a.t is not None
-        assert b.t is not None
-        force = law(0.5 * (a.q + b.q), velocity, 0.5 * (a.t + b.t))
-        return self.h * self.model.pull(self.start.q, self.at(end), force)
-
-    def step_work(self, b: State, end: Increment) -> Callable[[Law], Scalar]:
+    def step_work(self, b: State, end: Increment) -> Callable[[ForceLaw], Scalar]:
         """The work that a force does in the middle of the step."""
         velocity = self.velocity(end)
         return lambda law: self.load(law, self.start, b, end, velocity) @ end.rate
 
     def account(
-        self, dissipated: Scalar, work: Callable[[Law], Scalar], drive_work: Scalar | None
+        self,
+        dissipated: Scalar,
+        work: Callable[[ForceLaw], Scalar],
+        drive_work: Scalar | None,
     ) -> Energies:
         """The energies of a step, given the work that a force does in it."""
         if self.model.system.force is None:
@@ -97,47 +228,74 @@ class StepProblem(eqx.Module):
         total, damping = work(self.model.force), work(self.model.damping)
         return Energies(dissipated, total, -damping, drive_work)
 
+    def measured_account(
+        self,
+        end: State,
+        work: Callable[[ForceLaw], Scalar],
+        drive_work: Scalar | None,
+    ) -> Energies:
+        """The energies of a step of a scheme without an energy identity.
+
+        All that is missing in the balance counts as `dissipated`, of either sign.
+        """
+        energy = lambda state: self.model.kinetic(state) + self.model.potential(state)
+        account = self.account(energy(self.start) - energy(end), work, drive_work)
+        loss = account.dissipated
+        for supplied in (account.work, drive_work):
+            loss = loss if supplied is None else loss + supplied
+        return eqx.tree_at(lambda account: account.dissipated, account, loss)
+
     def joint_rate(self, state: State) -> JointMultipliers:
-        """`psi(q, v)` where the formulation holds it, else no rows."""
+        """`psi(q, v)` where the formulation imposes it, else no rows."""
         if self.formulation == "index3":
             return jnp.zeros((0,), state.q.dtype)
         return self.model.joint_rate(state.q, state.v, state.t)
 
-    def rows(
-        self, z: Increment, node: State, drive: Drive, moving: State | None = None
-    ) -> Increment:
-        """The rows of one node: the structure residual, and the constraints held there.
-
-        (Their rates those of the node `moving`, if it is another.)
-        """
-        structure = self.model.structure(self.start, node, self.h, z.rate, drive)
+    def rows(self, z: Increment, node: Node, gradient: Gradient) -> Increment:
+        """The rows of one node: the structure residual, and the constraints there."""
+        state, h = node.state, self.h
+        balance, rates = self.model.structure(self.start, state, h, z.rate, gradient)
         return Increment(
-            self.model.constraint(node.q, node.t) / self.h,
-            structure.impulse,
-            structure.drift,
-            self.joint_rate(node if moving is None else moving),
+            impulse=self.model.constraint(state.q, state.t) / h,
+            rate=balance,
+            momentum=rates,
+            velocity_impulse=self.joint_rate(node.in_joint_rate),
+        )
+
+    def rows_of_balance(self, balance: Coordinates, end: State) -> Increment:
+        """A balance of momentum, and the constraints at the end of the step.
+
+        For a problem that was made by `with_constant_inertia`; `balance` has the shape
+        `(nq,)` and is a momentum.
+        """
+        return Increment(
+            impulse=self.model.constraint(end.q, end.t) / self.h,
+            rate=balance,
+            momentum=jnp.zeros((0,), balance.dtype),
+            velocity_impulse=self.joint_rate(end),
         )
 
     def guess(self, acceleration: Velocities, multipliers: Multipliers) -> Increment:
         """The increment of a Taylor step of the whole length."""
         q, v, h = self.start.q, self.start.v, self.h
-        momentum = v + h * acceleration
         num_rates = jax.eval_shape(self.joint_rate, self.start).size
         return Increment(
-            h * multipliers,
-            self.model.lift(q, v + 0.5 * h * acceleration),
-            momentum if self.model.has_own_momenta else momentum[:0],
-            jnp.zeros((num_rates,), q.dtype),
+            impulse=h * multipliers,
+            rate=self.model.lift(q, v + 0.5 * h * acceleration),
+            momentum=self.model.momentum_rows(v + h * acceleration),
+            velocity_impulse=jnp.zeros((num_rates,), q.dtype),
         )
 
 
 class StepEnd(eqx.Module):
     """What a solved step yields.
 
-    - `state`: at the end of the step.
-    - `displacement`: of the configuration over the step, not yet rounded to that of `q`.
-    - `multipliers`: `lambda` of the step, joints first (energy per constraint unit).
-    - `energies`: where the energy went.
+    - `state`: at the end of the step, as the model has it.
+    - `displacement`: of the coordinates over the step, shape `(nq,)`, `h` times the rate
+      that was solved for. It is more exact than the difference of two rounded `q`.
+    - `multipliers`: `lambda` of the step, shape `(nc,)`, joints first (energy per
+      constraint unit).
+    - `energies`: the energy account.
     - `details`: what the scheme reports of its own, or `None`.
     - `result`: a failure that the scheme itself can see.
     - `carried`: what a scheme with a memory hands to its next step; of others `None`.
@@ -147,8 +305,8 @@ class StepEnd(eqx.Module):
     displacement: Coordinates
     multipliers: Multipliers
     energies: Energies
-    details: PyTree[Any]
-    result: RESULTS
+    details: PyTree[Any] = None
+    result: RESULTS = eqx.field(default_factory=lambda: RESULTS.successful)
     carried: PyTree[Any] = None
 
 
@@ -167,16 +325,21 @@ class AbstractScheme(eqx.Module):
 
     @property
     @abc.abstractmethod
-    def stage(self) -> "AbstractSingleSolve":
+    def stage(self) -> "AbstractOneSolveScheme":
         """The scheme of each of these solves."""
 
 
-class AbstractSingleSolve(AbstractScheme, Generic[Z, P]):
-    """A scheme whose step is one nonlinear solve.
+class AbstractOneSolveScheme(AbstractScheme, Generic[Z, P]):
+    """A scheme whose step is one nonlinear solve: the base class for schemes of your own.
 
-    `Z` is a pytree of `Increment`s, one for each node of the step, and of the scheme's
-    own scalar unknowns, which must be dimensionless. `residual` returns the same
-    structure, with rows in the places of the unknowns. `P` is what stays fixed in a step.
+    `Z` is a pytree of `Increment`s, one for each node of the step and that of the end of
+    the step last, and of the scheme's own scalar unknowns, which must be dimensionless.
+    `residual` returns the same structure, with rows in the places of the unknowns. `P` is
+    what is fixed in a step, a `StepProblem` or a module that contains one.
+
+    A subclass is an `equinox.Module` that defines `order`, `formulation`, `symmetric`,
+    `problem`, `predict`, `residual` and `finish`. It never solves: the step equations are
+    scaled, solved and differentiated by the run, for whichever scheme.
     """
 
     @property
@@ -184,13 +347,13 @@ class AbstractSingleSolve(AbstractScheme, Generic[Z, P]):
         return (1.0,)
 
     @property
-    def stage(self) -> "AbstractSingleSolve":
+    def stage(self) -> "AbstractOneSolveScheme":
         return self
 
     @property
     @abc.abstractmethod
     def formulation(self) -> Formulation:
-        """The levels at which joints are held."""
+        """The levels at which joints are imposed: `"ggl"` or `"index3"`."""
 
     @property
     @abc.abstractmethod
@@ -199,7 +362,7 @@ class AbstractSingleSolve(AbstractScheme, Generic[Z, P]):
 
     @abc.abstractmethod
     def problem(self, model: AbstractModel, start: State, h: Scalar) -> P:
-        """The data of a step: a `StepProblem`, or one with more that stays fixed."""
+        """The data of a step. Raises a `ValueError` for a system that it cannot treat."""
 
     @abc.abstractmethod
     def predict(self, problem: P, acceleration: Velocities, multipliers: Multipliers) -> Z:
@@ -214,30 +377,19 @@ class AbstractSingleSolve(AbstractScheme, Generic[Z, P]):
         """The end of the step from the solved unknowns."""
 
 
-class AbstractSimplifiedSolve(AbstractSingleSolve[Z, P], Generic[Z, P]):
-    """A scheme with weak couplings between neighbours, which a search can do without."""
-
-    @abc.abstractmethod
-    def simplified(self, z: Z, held: Z, problem: P) -> Z:
-        """The residual where `held` is `z`; weak couplings stay at `held`.
-
-        A large system is searched with the Jacobian of this: fewer unknowns meet in a row.
-        """
-
-
-class AbstractCarryingSolve(AbstractSingleSolve[Z, P], Generic[Z, P]):
+class AbstractSchemeWithMemory(AbstractOneSolveScheme[Z, P], Generic[Z, P]):
     """A scheme that remembers more of the last step than the state at its end.
 
-    What it remembers travels beside the state, as `StepEnd.carried`, and is differentiated
-    like it. Such a scheme is no map from state to state, so it cannot be composed.
+    What it remembers is returned as `StepEnd.carried`, and is differentiated like the
+    state. Such a scheme is not a map from state to state, so it cannot be composed.
     """
 
     @abc.abstractmethod
     def begin(
         self, model: AbstractModel, start: State, h: Scalar, acceleration: Velocities
     ) -> PyTree[Any]:
-        """What the first step of a run is handed."""
+        """What is carried into the first step of a run."""
 
     @abc.abstractmethod
     def resume(self, problem: P, carried: PyTree[Any]) -> P:
-        """The data of a step, with what the step before has handed on."""
+        """The data of a step, with what the step before has carried into it."""

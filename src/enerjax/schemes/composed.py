@@ -1,6 +1,6 @@
 import equinox as eqx
 
-from .base import AbstractScheme, AbstractSingleSolve
+from .base import AbstractOneSolveScheme, AbstractScheme
 
 
 class Composed(AbstractScheme):
@@ -34,14 +34,14 @@ class Composed(AbstractScheme):
     with the smallest largest stage.
     """
 
-    scheme: AbstractSingleSolve
+    scheme: AbstractOneSolveScheme
     # Static, and known when the composition is made: under a transformation the numbers
     # of the scheme are traced, and whether alpha is 0 can no longer be seen.
     orders: tuple[int, int] = eqx.field(static=True)
 
-    def __init__(self, scheme: AbstractSingleSolve, order: int):
+    def __init__(self, scheme: AbstractOneSolveScheme, order: int):
         name = type(scheme).__name__
-        if not isinstance(scheme, AbstractSingleSolve) or not scheme.symmetric:
+        if not isinstance(scheme, AbstractOneSolveScheme) or not scheme.symmetric:
             raise ValueError(
                 f"`Composed({name})`: only symmetric schemes gain order by composition, "
                 "`EnergyPreserving()` and `EnergyConsistent(0.0)`. The others dissipate, "
@@ -65,7 +65,7 @@ class Composed(AbstractScheme):
         return (*half, 1 - 2 * sum(half), *reversed(half))
 
     @property
-    def stage(self) -> AbstractSingleSolve:
+    def stage(self) -> AbstractOneSolveScheme:
         return self.scheme
 
 

@@ -1,35 +1,31 @@
 from typing import TypeAlias
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .._discrete import AbstractDerivative, MeanValue
-from .._operators import (
-    AbstractModel,
-    CanonicalModel,
-    Drive,
-    Increment,
-    SeparableModel,
-    Time,
-)
+from .._operators import AbstractModel, Gradient, Increment, Reaction
 from .._programs import is_known
-from .._results import RESULTS
 from .._solvers import Assembled
 from .._system import State
-from .._types import Coordinates, Multipliers, Real, Scalar, Velocities
-from ._checks import check_derivative
-from ._decaying import alpha_from_spectral_radius, as_alpha, JumpAndEnd
-from ._frozen import freeze, Frozen
-from .base import AbstractSingleSolve, Formulation, StepEnd, StepProblem
+from .._types import Multipliers, Real, Scalar, Velocities
+from ._arguments import alpha_from_spectral_radius, as_alpha, check_derivative
+from ._discontinuous import JumpAndEnd
+from ._dissipative_stiffness import dissipative_stiffness, DissipativeStiffness
+from .base import AbstractOneSolveScheme, Formulation, Node, StepEnd, StepProblem
 
 
-# The end of the step, and where it is an unknown the jump, a velocity.
+# The end of the step; for large systems also the jump of the velocities.
 _Unknowns: TypeAlias = Increment | JumpAndEnd
 
 
-class EnergyConsistent(AbstractSingleSolve[_Unknowns, Frozen]):
+class _Problem(eqx.Module):
+    step: StepProblem
+    dissipative: DissipativeStiffness
+
+
+class EnergyConsistent(AbstractOneSolveScheme[_Unknowns, _Problem]):
     r"""One interval, order 4 or 3, and decay for any potential.
 
     The jump `j` of the discontinuous schemes in closed form, so that the unknowns are
@@ -106,7 +102,7 @@ class EnergyConsistent(AbstractSingleSolve[_Unknowns, Frozen]):
     def order(self) -> int:
         return 4 if self.symmetric else 3
 
-    def problem(self, model: AbstractModel, start: State, h: Scalar) -> Frozen:
+    def problem(self, model: AbstractModel, start: State, h: Scalar) -> _Problem:
         if not model.has_canonical_rates:
             raise ValueError(
                 "`EnergyConsistent` needs velocities that are the rates of the "
@@ -114,135 +110,117 @@ class EnergyConsistent(AbstractSingleSolve[_Unknowns, Frozen]):
                 "or `EnergyDecaying`, or describe rotations without `kinematics` "
                 "(directors, or `System.from_hamiltonian`)."
             )
-        step = StepProblem(model, start, h, self.derivative, "ggl")
-        return freeze(step, self._alpha(h))
+        step = StepProblem(model, start, h, self.derivative)
+        return _Problem(step, dissipative_stiffness(step, self._alpha(h)))
 
     def predict(
-        self, problem: Frozen, acceleration: Velocities, multipliers: Multipliers
+        self, problem: _Problem, acceleration: Velocities, multipliers: Multipliers
     ) -> _Unknowns:
         guess = problem.step.guess(acceleration, multipliers)
-        if not isinstance(problem.stiffness, Assembled):
+        if not isinstance(problem.dissipative.matrix, Assembled):
             return guess
         none = guess.momentum
         return JumpAndEnd(Increment(none, jnp.zeros_like(guess.rate), none, none), guess)
 
-    def residual(self, z: _Unknowns, problem: Frozen) -> _Unknowns:
+    def residual(self, z: _Unknowns, problem: _Problem) -> _Unknowns:
+        end, jump = self._end_and_jump(z, problem)
         if not isinstance(z, JumpAndEnd):
-            return self._rows(z, problem, *self._end(z, problem, None))
-        h, alpha = problem.step.h, self._alpha(problem.step.h)
-        end, jump_v = self._end(z.end, problem, z.jump.rate)
-        # (M + lag^2 P) j_v - (h/6) P (dq + lag dv)
-        dv = end.v - problem.step.start.v
-        pushed = problem.stiffness @ (
-            h * z.end.rate + alpha * h / 6 * (dv - alpha * jump_v)
+            return self._rows(z, problem, end, jump)
+        step, dissipative, alpha = (
+            problem.step,
+            problem.dissipative,
+            self._alpha(problem.step.h),
         )
-        jump_row = problem.inertia @ jump_v - h / 6 * pushed
-        jump_rows = eqx.tree_at(lambda rows: rows.rate, z.jump, jump_row)
-        return JumpAndEnd(jump_rows, self._rows(z.end, problem, end, jump_v))
+        # (M + tau^2 K+) j_v - (h/6) K+ (dq + tau dv)
+        dv = end.state.v - step.start.v
+        moved = step.h * z.end.rate + alpha * step.h / 6 * (dv - alpha * jump)
+        row = dissipative.inertia @ jump - step.h / 6 * (dissipative.matrix @ moved)
+        jump_rows = eqx.tree_at(lambda rows: rows.rate, z.jump, row)
+        return JumpAndEnd(jump_rows, self._rows(z.end, problem, end, jump))
+
+    def finish(self, z: _Unknowns, problem: _Problem) -> StepEnd:
+        step, dissipative, h = problem.step, problem.dissipative, problem.step.h
+        node, jump_v = self._end_and_jump(z, problem)
+        end, z, alpha = node.state, _end_of(z), self._alpha(h)
+        dv = self._velocity_change(end, problem)
+        jump_q = -h / 6 * (dv - alpha * jump_v)
+        size = jump_q @ (dissipative.matrix @ jump_q)
+        size = size + jump_v @ (dissipative.inertia @ jump_v)
+        drive_work = step.drive_work(step.start, end, z)
+        if drive_work is not None:
+            skew_work = self._skew_gradient(z, step, end).work
+            assert skew_work is not None
+            drive_work = drive_work - h / 12 * skew_work
+        return StepEnd(
+            state=end,
+            displacement=h * z.rate,
+            multipliers=z.impulse / h,
+            energies=step.account(0.5 * alpha * size, step.step_work(end, z), drive_work),
+        )
 
     def _rows(
-        self, z: Increment, problem: Frozen, end: State, jump_v: Velocities
+        self, z: Increment, problem: _Problem, end: Node, jump_v: Velocities
     ) -> Increment:
-        step, h = problem.step, problem.step.h
-        drive = step.drive(step.start, end, z).less(step.step_load(end, z))
-        twist = self._twist(z, problem, end.v - step.start.v)
-        dissipation = h**2 / 12 * self._alpha(h) * (problem.stiffness @ jump_v)
-        impulse = drive.impulse - h / 12 * twist.impulse + dissipation
-        drift = drive.drift
-        if step.model.has_own_momenta:
-            undamped = h / 6 * problem.compliance @ (problem.stiffness @ (h * z.rate))
-            drift = drift - h / 12 * twist.drift + 0.5 * (jump_v - undamped)
-        return step.rows(z, end, Drive(impulse, drift))
-
-    def finish(self, z: _Unknowns, problem: Frozen) -> StepEnd:
-        step, h, alpha = problem.step, problem.step.h, self._alpha(problem.step.h)
-        z, jump = (z.end, z.jump.rate) if isinstance(z, JumpAndEnd) else (z, None)
-        end, jump_v = self._end(z, problem, jump)
-        dv = self._velocity(problem, end.v - step.start.v)
-        jump_q = -h / 6 * (dv - alpha * jump_v)
-        size = jump_q @ (problem.stiffness @ jump_q) + jump_v @ (problem.inertia @ jump_v)
-        work, drive_work = step.step_work(end, z), self._drive_work(z, problem, end)
-        return StepEnd(
-            end,
-            h * z.rate,
-            z.impulse / h,
-            step.account(0.5 * alpha * size, work, drive_work),
-            None,
-            RESULTS.successful,
+        step, dissipative, h = problem.step, problem.dissipative, problem.step.h
+        gradient = step.discrete_gradient(step.start, end.in_gradient, z)
+        gradient = gradient.less(step.step_load(end.state, z))
+        skew = self._skew_gradient(z, step, end.state)
+        # What `(j(alpha) - j(0))/2`, with P, adds to both parts of the gradient.
+        force = h**2 / 12 * self._alpha(h) * (dissipative.matrix @ jump_v)
+        undamped = dissipative.inverse_inertia @ (dissipative.matrix @ (h**2 / 6 * z.rate))
+        rate = step.model.momentum_rows(0.5 * (jump_v - undamped))
+        total = Gradient(
+            impulse=gradient.impulse - h / 12 * skew.impulse + force,
+            rate=gradient.rate - h / 12 * skew.rate + rate,
         )
+        return step.rows(z, end, total)
 
-    def _drive_work(self, z: Increment, problem: Frozen, end: State) -> Scalar | None:
-        """The work of driven constraints, and what the twist adds to it."""
-        step = problem.step
-        if (work := step.drive_work(step.start, end, z)) is None:
-            return None
-        twist = self._twist(z, problem, end.v - step.start.v)
-        assert twist.work is not None
-        return work - step.h / 12 * twist.work
+    def _end_and_jump(self, z: _Unknowns, problem: _Problem) -> tuple[Node, Velocities]:
+        """The end of the step, and the jump `j_v` of the velocities."""
+        step, dissipative, h = problem.step, problem.dissipative, problem.step.h
+        jump_v = z.jump.rate if isinstance(z, JumpAndEnd) else None
+        z = _end_of(z)
+        start, dq, q1, t1 = step.start, h * z.rate, step.position(z), step.end_time
 
-    def _alpha(self, h: Scalar) -> Scalar:
-        return self.alpha.astype(h.dtype)
+        def velocity(reaction: Reaction) -> tuple[Velocities]:
+            at_start = reaction(start.q, start.t, z.velocity_impulse)
+            at_end = reaction(q1, t1, z.velocity_impulse)
+            curvature, _ = step.model.stiffness_product(
+                self._middle(z, step, start.v), z.impulse / h, (dq, step.duration)
+            )
+            force = h / 6 * (curvature - dissipative.matrix @ dq)
+            # The row S_mu, solved for v1 - v0. The jump depends on this change itself.
+            right = 2 * (z.rate - start.v) - (at_start + at_end)
+            right = right - dissipative.inverse_inertia @ force
+            if jump_v is not None:
+                return (start.v + right - jump_v,)
+            right = right - dissipative.jump_matrix @ dq
+            return (start.v + dissipative.velocity_matrix @ right,)
 
-    def _velocity(self, problem: Frozen, dv: Velocities) -> Velocities:
-        """A change of velocity, from what the states hold."""
-        return problem.compliance @ dv if problem.step.model.has_own_momenta else dv
+        (end,) = step.nodes(velocity, (z, t1))
+        if jump_v is None:
+            dv = self._velocity_change(end.state, problem)
+            jump_v = dissipative.jump_matrix @ (dq + self._alpha(h) * h / 6 * dv)
+        return end, jump_v
 
-    def _twist(self, z: Increment, problem: Frozen, dv: Velocities) -> Drive:
-        """`D J D (z1 - z0)`, `h` times in the first part, with `D` at the midpoint.
+    def _velocity_change(self, end: State, problem: _Problem) -> Velocities:
+        step, dissipative = problem.step, problem.dissipative
+        change = end.v - step.start.v
+        return step.model.velocity_change(change, dissipative.inverse_inertia)
 
-        It is orthogonal to `z1 - z0`, so it does no work. Where velocities are eliminated
-        only the first part is needed: `h K dv`. Where time enters it is a coordinate,
-        whose momentum nothing depends on.
-        """
-        step, model, h = problem.step, problem.step.model, problem.step.h
-        no_lapse = jax.tree.map(jnp.zeros_like, step.middle_time)
-        if isinstance(model, SeparableModel):
-            force, power = self._stiffness(z, problem, (dv, no_lapse))
-            return Drive(force, dv[:0], power)
-        assert isinstance(model, CanonicalModel)
+    def _skew_gradient(self, z: Increment, step: StepProblem, end: State) -> Gradient:
+        """`D J D (z1 - z0)` at the midpoint, `h` times in the first part."""
+        dv = end.v - step.start.v
+        middle = self._middle(z, step, step.start.v + 0.5 * dv)
+        change = (step.h * z.rate, dv, step.duration)
+        return step.model.skew_gradient(middle, z.impulse / step.h, change, step.h)
 
-        def action(q: Coordinates, p: Velocities, t: Time) -> Scalar:
-            return h * model.hamiltonian(q, p) + z.impulse @ model.constraint(q, t)
+    def _middle(self, z: Increment, step: StepProblem, v: Velocities) -> State:
+        return State(step.start.q + 0.5 * step.h * z.rate, v, step.middle_time)
 
-        forces = jax.grad(action, argnums=(0, 1, 2))
-        middle = step.start.q + 0.5 * h * z.rate
-        at = middle, step.start.v + 0.5 * dv, step.middle_time
-        # h D: one factor h remains in the second product, and is divided out for `w_mu`.
-        _, (force, rate, _) = jax.jvp(forces, at, (h * z.rate, dv, step.lapse))
-        _, (force, rate, power) = jax.jvp(forces, at, (rate / h, -force / h, no_lapse))
-        return Drive(force, rate / h, power)
+    def _alpha(self, like: Scalar) -> Scalar:
+        return self.alpha.astype(like.dtype)
 
-    def _stiffness(
-        self, z: Increment, problem: Frozen, along: tuple[Coordinates, Time]
-    ) -> tuple[Coordinates, Time]:
-        """`h K` at the midpoint times a vector, with its row and column of time."""
-        step, model, h = problem.step, problem.step.model, problem.step.h
-        assert isinstance(model, SeparableModel)
-        middle = step.start.q + 0.5 * h * z.rate, step.middle_time
-        action = lambda q, t: h * model.strain(q, t, z.impulse / h)
-        return jax.jvp(jax.grad(action, argnums=(0, 1)), middle, along)[1]
 
-    def _end(
-        self, z: Increment, problem: Frozen, jump: Velocities | None
-    ) -> tuple[State, Velocities]:
-        """The end of the step, and `j_v` of the dissipative jump, where it is not given."""
-        step, model, h = problem.step, problem.step.model, problem.step.h
-        start, dq, lag = step.start, h * z.rate, self._alpha(h) * h / 6
-        if not isinstance(model, SeparableModel):
-            end = step.node(z, step.end_time)
-            dv = self._velocity(problem, end.v - start.v)
-            return end, problem.jump @ (dq + lag * dv)
-        q1, t1 = step.at(z), step.end_time
-        reaction = model.mean_reaction(start.q, start.t, q1, t1, z.velocity_impulse)
-        curved, _ = self._stiffness(z, problem, (dq, step.lapse))
-        # The upper half of the step equations, solved for the change of velocity; what
-        # the dissipative jump adds to them depends on that change itself.
-        right = (
-            2 * (z.rate - start.v - reaction)
-            - model.inverse_inertia @ (curved - h * (problem.stiffness @ dq)) / 6
-        )
-        if jump is not None:
-            return State(q1, start.v + right - jump, t1), jump
-        pushed = problem.jump @ dq
-        dv = problem.damping @ (right - pushed)
-        return State(q1, start.v + dv, t1), pushed + lag * problem.jump @ dv
+def _end_of(z: _Unknowns) -> Increment:
+    return z.end if isinstance(z, JumpAndEnd) else z

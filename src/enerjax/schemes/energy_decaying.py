@@ -1,26 +1,28 @@
 import equinox as eqx
 
 from .._discrete import AbstractDerivative, ChainRule
-from .._operators import AbstractModel, SeparableModel
-from .._results import RESULTS
+from .._operators import AbstractModel, Reaction
 from .._system import State
 from .._types import Multipliers, Real, Scalar, Velocities
-from ._checks import check_derivative, check_formulation
-from ._decaying import (
+from ._arguments import (
     alpha_from_spectral_radius,
     as_alpha,
-    jump_drive,
+    check_derivative,
+    check_formulation,
+)
+from ._discontinuous import (
     jump_energy,
+    jump_gradient,
     jump_loads,
     jump_work,
     JumpAndEnd,
     predict_jump_and_end,
     split_velocities,
 )
-from .base import AbstractSimplifiedSolve, Formulation, StepEnd, StepProblem
+from .base import AbstractOneSolveScheme, Formulation, Node, StepEnd, StepProblem
 
 
-class EnergyDecaying(AbstractSimplifiedSolve[JumpAndEnd, StepProblem]):
+class EnergyDecaying(AbstractOneSolveScheme[JumpAndEnd, StepProblem]):
     """Discontinuous Galerkin scheme: the energy decays by `alpha` times a jump.
 
     The state jumps from `z0` to `zj` at the start of the step and moves on to `z1`:
@@ -36,7 +38,7 @@ class EnergyDecaying(AbstractSimplifiedSolve[JumpAndEnd, StepProblem]):
       `(zj - z0) . (grad H(zj) - grad H(z0)) / 2`, and `H` must be convex.) On a linear
       oscillator of frequency `w` the step tends to `rho_inf = (1 - alpha) / (1 + alpha)`
       as `h w` grows. Forces enter the intervals like `-grad V`; a damper `-C v` with
-      constant `C` never feeds energy in.
+      constant `C` never creates energy.
     - Constraints held at: position level at `zj` and `z1`; with `formulation="ggl"`
       velocity level too.
     - Order: 2. Unconstrained with `v = qdot`, 3 with `MeanValue()` or one coordinate, and
@@ -86,7 +88,9 @@ class EnergyDecaying(AbstractSimplifiedSolve[JumpAndEnd, StepProblem]):
         return False
 
     def problem(self, model: AbstractModel, start: State, h: Scalar) -> StepProblem:
-        return StepProblem(model, start, h, self.derivative, self.formulation)
+        return StepProblem(
+            model, start, h, self.derivative, self.formulation, weak_couplings="exact"
+        )
 
     def predict(
         self, problem: StepProblem, acceleration: Velocities, multipliers: Multipliers
@@ -94,74 +98,51 @@ class EnergyDecaying(AbstractSimplifiedSolve[JumpAndEnd, StepProblem]):
         return predict_jump_and_end(problem, acceleration, multipliers)
 
     def residual(self, z: JumpAndEnd, problem: StepProblem) -> JumpAndEnd:
-        nodes = self._nodes(z, problem, z)
-        return self._rows(z, problem, nodes, nodes, nodes)
-
-    def simplified(
-        self, z: JumpAndEnd, held: JumpAndEnd, problem: StepProblem
-    ) -> JumpAndEnd:
-        if not isinstance(problem.model, SeparableModel):
-            return self.residual(z, problem)
-        # As of `EnergyPreserving`.
-        parts = lambda z: (z.jump.velocity_impulse, z.end.velocity_impulse)
-        still = eqx.tree_at(parts, z, parts(held))
-        nodes, moving = self._nodes(z, problem, z), self._nodes(z, problem, held)
-        return self._rows(z, problem, nodes, moving, self._nodes(still, problem, held))
-
-    def _rows(
-        self,
-        z: JumpAndEnd,
-        problem: StepProblem,
-        nodes: tuple[State, State],
-        moving: tuple[State, State],
-        driven: tuple[State, State],
-    ) -> JumpAndEnd:
-        """The rows; the nodes differ in the reactions that are part of their velocities."""
         model, start, h = problem.model, problem.start, problem.h
-        jump, end = nodes
-        loads = jump_loads(self.alpha, z, problem, jump, end)
-        after = problem.drive(*driven, z.end).less(loads.after)
-        before = problem.drive(start, driven[0], z.jump).less(loads.before)
+        jump, end = self._nodes(z, problem)
+        loads = jump_loads(self.alpha, z, problem, jump.state, end.state)
+        after = problem.discrete_gradient(jump.in_gradient, end.in_gradient, z.end)
+        before = problem.discrete_gradient(start, jump.in_gradient, z.jump)
+        after, before = after.less(loads.after), before.less(loads.before)
         at_start = model.gradient(start, h).less(loads.start)
-        at_jump = model.gradient(jump, h).less(loads.jump)
-        to_jump = jump_drive(self.alpha, after, before, at_start, at_jump)
+        at_jump = model.gradient(jump.state, h).less(loads.jump)
+        to_jump = jump_gradient(self.alpha, after, before, at_start, at_jump)
         return JumpAndEnd(
-            problem.rows(z.jump, jump, to_jump, moving[0]),
-            problem.rows(z.end, end, after, moving[1]),
+            jump=problem.rows(z.jump, jump, to_jump),  # eq. (47b)
+            end=problem.rows(z.end, end, after),  # eq. (47a)
         )
 
     def finish(self, z: JumpAndEnd, problem: StepProblem) -> StepEnd:
-        jump, end = self._nodes(z, problem, z)
+        jump, end = (node.state for node in self._nodes(z, problem))
         kinetic, potential = jump_energy(problem, jump)
         dissipated = self.alpha.astype(kinetic.dtype) * (kinetic + potential)
         work = jump_work(self.alpha, z, problem, jump, end)
         drive_work = problem.drive_work(jump, end, z.end)
         return StepEnd(
-            end,
-            problem.h * z.end.rate,
-            z.end.impulse / problem.h,
-            problem.account(dissipated, work, drive_work),
-            None,
-            RESULTS.successful,
+            state=end,
+            displacement=problem.h * z.end.rate,
+            multipliers=z.end.impulse / problem.h,
+            energies=problem.account(dissipated, work, drive_work),
         )
 
-    def _nodes(
-        self, z: JumpAndEnd, problem: StepProblem, held: JumpAndEnd
-    ) -> tuple[State, State]:
-        """After the jump and at the end, with their reactions where `held` is."""
-        model, q0, v0 = problem.model, problem.start.q, problem.start.v
-        # The jump takes no time.
-        t0, t1 = problem.start.t, problem.end_time
-        if not isinstance(model, SeparableModel):
-            return problem.node(z.jump, t0), problem.node(z.end, t1)
-        qj, q1 = problem.at(z.jump), problem.at(z.end)
-        rj, r1 = (qj, q1) if held is z else map(problem.at, (held.jump, held.end))
-        after = model.mean_reaction(rj, t0, r1, t1, z.end.velocity_impulse)
-        before = model.mean_reaction(q0, t0, rj, t0, z.jump.velocity_impulse)
-        vj, v1 = split_velocities(
-            self.alpha,
-            v0,
-            2 * (problem.velocity(z.end) - after),  # eq. (47d): vj + v1
-            -6 * model.push(q0, qj, z.jump.rate) - 2 * (after - before),  # eq. (47e)
-        )
-        return State(qj, vj, t0), State(q1, v1, t1)
+    def _nodes(self, z: JumpAndEnd, problem: StepProblem) -> tuple[Node, ...]:
+        """The nodes after the jump, which takes no time, and at the end."""
+        model, start = problem.model, problem.start
+        qj, q1 = problem.position(z.jump), problem.position(z.end)
+        t0, t1 = start.t, problem.end_time
+
+        def velocities(reaction: Reaction) -> tuple[Velocities, Velocities]:
+            mean = lambda qa, ta, qb, tb, eta: (
+                0.5 * (reaction(qa, ta, eta) + reaction(qb, tb, eta))
+            )
+            after = mean(qj, t0, q1, t1, z.end.velocity_impulse)
+            before = mean(start.q, t0, qj, t0, z.jump.velocity_impulse)
+            return split_velocities(
+                self.alpha,
+                start.v,
+                2 * (problem.velocity(z.end) - after),  # eq. (47d): vj + v1
+                # eq. (47e)
+                -6 * model.push(start.q, qj, z.jump.rate) - 2 * (after - before),
+            )
+
+        return problem.nodes(velocities, (z.jump, t0), (z.end, t1))

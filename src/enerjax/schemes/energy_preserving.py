@@ -2,22 +2,21 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._discrete import AbstractDerivative, ChainRule
-from .._operators import AbstractModel, Increment, SeparableModel
-from .._results import RESULTS
+from .._operators import AbstractModel, Increment, Reaction
 from .._system import State
 from .._types import Multipliers, Scalar, Velocities
-from ._checks import check_derivative, check_formulation
-from .base import AbstractSimplifiedSolve, Formulation, StepEnd, StepProblem
+from ._arguments import check_derivative, check_formulation
+from .base import AbstractOneSolveScheme, Formulation, Node, StepEnd, StepProblem
 
 
-class EnergyPreserving(AbstractSimplifiedSolve[Increment, StepProblem]):
+class EnergyPreserving(AbstractOneSolveScheme[Increment, StepProblem]):
     """Continuous Galerkin scheme: keeps the total energy, damps nothing.
 
     Solves `S(z0, z1, DH(z0, z1)) = 0` with the constraints at the end of the step.
 
-    - Conserves: energy, to round-off, at any step. With forces and drives it changes by
-      their work: that of a force in the middle of the step, at the velocity
-      `Lm (q1 - q0)/h`, so a damper never feeds energy in.
+    - Conserves: energy, to round-off, at any step. With forces and driven constraints it
+      changes by their work. Forces act in the middle of the step, at the velocity
+      `Lm (q1 - q0)/h`, so a damper never creates energy.
     - Dissipates: nothing, high-frequency noise included.
     - Constraints held at: position level; with `formulation="ggl"` velocity level too.
     - Order: 2. Symmetric: `Composed` raises the order to 4, 6 or 8.
@@ -50,7 +49,9 @@ class EnergyPreserving(AbstractSimplifiedSolve[Increment, StepProblem]):
         return True
 
     def problem(self, model: AbstractModel, start: State, h: Scalar) -> StepProblem:
-        return StepProblem(model, start, h, self.derivative, self.formulation)
+        return StepProblem(
+            model, start, h, self.derivative, self.formulation, weak_couplings="exact"
+        )
 
     def predict(
         self, problem: StepProblem, acceleration: Velocities, multipliers: Multipliers
@@ -58,48 +59,33 @@ class EnergyPreserving(AbstractSimplifiedSolve[Increment, StepProblem]):
         return problem.guess(acceleration, multipliers)
 
     def residual(self, z: Increment, problem: StepProblem) -> Increment:
-        end = self._end(z, problem, z)
-        return self._rows(z, problem, end, end, end)
-
-    def simplified(self, z: Increment, held: Increment, problem: StepProblem) -> Increment:
-        if not isinstance(problem.model, SeparableModel):
-            return self.residual(z, problem)
-        # In the velocity that `psi` is taken of, the reaction with the gradients as they
-        # are: these change it by as little as eta is small. In its drive, which has the
-        # factor eta, the whole reaction.
-        end, moving = self._end(z, problem, z), self._end(z, problem, held)
-        still = eqx.tree_at(lambda z: z.velocity_impulse, z, held.velocity_impulse)
-        return self._rows(z, problem, end, moving, self._end(still, problem, held))
-
-    def _rows(
-        self, z: Increment, problem: StepProblem, end: State, moving: State, driven: State
-    ) -> Increment:
-        """The rows; the ends differ in the reaction that is part of their velocities."""
-        drive = problem.drive(problem.start, driven, z)
-        load = problem.step_load(end, z)
-        return problem.rows(z, end, drive.less(load), moving)  # eq. (14a, c)
+        end = self._end(z, problem)
+        gradient = problem.discrete_gradient(problem.start, end.in_gradient, z)
+        load = problem.step_load(end.state, z)
+        return problem.rows(z, end, gradient.less(load))  # eq. (14a, c)
 
     def finish(self, z: Increment, problem: StepProblem) -> StepEnd:
-        end = self._end(z, problem, z)
-        drive_work = problem.drive_work(problem.start, end, z)
-        nothing = jnp.zeros_like(problem.h)
+        end = self._end(z, problem).state
+        work, drive_work = (
+            problem.step_work(end, z),
+            problem.drive_work(problem.start, end, z),
+        )
         return StepEnd(
-            end,
-            problem.h * z.rate,
-            z.impulse / problem.h,
-            problem.account(nothing, problem.step_work(end, z), drive_work),
-            None,
-            RESULTS.successful,
+            state=end,
+            displacement=problem.h * z.rate,
+            multipliers=z.impulse / problem.h,
+            energies=problem.account(jnp.zeros_like(problem.h), work, drive_work),
         )
 
-    def _end(self, z: Increment, problem: StepProblem, held: Increment) -> State:
-        """The end of the step, with its reaction where `held` is."""
-        model, start = problem.model, problem.start
-        if not isinstance(model, SeparableModel):
-            return problem.node(z, problem.end_time)
-        q1, t1 = problem.at(z), problem.end_time
-        # eq. (14b), solved for the velocity
-        mean = problem.velocity(z)
-        r1 = q1 if held is z else problem.at(held)
-        mean = mean - model.mean_reaction(start.q, start.t, r1, t1, z.velocity_impulse)
-        return State(q1, 2 * mean - start.v, t1)
+    def _end(self, z: Increment, problem: StepProblem) -> Node:
+        start, q1, t1 = problem.start, problem.position(z), problem.end_time
+
+        def velocity(reaction: Reaction) -> tuple[Velocities]:
+            at_start = reaction(start.q, start.t, z.velocity_impulse)
+            at_end = reaction(q1, t1, z.velocity_impulse)
+            # eq. (14b), solved for v1
+            mean = problem.velocity(z) - 0.5 * (at_start + at_end)
+            return (2 * mean - start.v,)
+
+        (end,) = problem.nodes(velocity, (z, t1))
+        return end

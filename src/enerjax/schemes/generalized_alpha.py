@@ -5,19 +5,10 @@ import numpy as np
 
 from .._operators import AbstractModel, Increment
 from .._programs import is_known
-from .._results import RESULTS
 from .._system import State
 from .._types import Multipliers, Real, Scalar, Velocities
-from ._baseline import (
-    balance_rows,
-    measured_account,
-    model_of,
-    plain_problem,
-    reaction_force,
-)
-from ._checks import check_formulation
-from ._decaying import alpha_from_spectral_radius
-from .base import AbstractCarryingSolve, Formulation, StepEnd, StepProblem
+from ._arguments import alpha_from_spectral_radius, check_formulation
+from .base import AbstractSchemeWithMemory, Formulation, StepEnd, StepProblem
 
 
 class _Carried(eqx.Module):
@@ -32,7 +23,7 @@ class _AlphaProblem(eqx.Module):
     before: _Carried | None
 
 
-class GeneralizedAlpha(AbstractCarryingSolve[Increment, _AlphaProblem]):
+class GeneralizedAlpha(AbstractSchemeWithMemory[Increment, _AlphaProblem]):
     """The generalized-alpha method for index-3 systems; for comparison.
 
     An auxiliary acceleration `a`, carried from step to step, drives positions and
@@ -149,7 +140,9 @@ class GeneralizedAlpha(AbstractCarryingSolve[Increment, _AlphaProblem]):
         return False
 
     def problem(self, model: AbstractModel, start: State, h: Scalar) -> _AlphaProblem:
-        step = plain_problem("GeneralizedAlpha", model, start, h, self.formulation)
+        step = StepProblem.with_constant_inertia(
+            "GeneralizedAlpha", model, start, h, self.formulation
+        )
         return _AlphaProblem(step, None)
 
     def begin(
@@ -166,16 +159,16 @@ class GeneralizedAlpha(AbstractCarryingSolve[Increment, _AlphaProblem]):
         return problem.step.guess(acceleration, multipliers)
 
     def residual(self, z: Increment, problem: _AlphaProblem) -> Increment:
-        step, model = problem.step, model_of(problem.step)
+        step, model = problem.step, problem.step.separable_model
         end, after = self._end(z, problem)
         load = model.inertia @ after.acceleration + model.slope(end)
-        balance = step.h * load + reaction_force(model, end.q, end.t, z.impulse)
-        return balance_rows(step, balance, z, end)
+        balance = step.h * load + model.constraint_force(end.q, end.t, z.impulse)
+        return step.rows_of_balance(balance, end)
 
     def finish(self, z: Increment, problem: _AlphaProblem) -> StepEnd:
         step, before = problem.step, problem.before
         assert before is not None
-        model, half = model_of(step), 0.5 * step.h
+        model, half = step.separable_model, 0.5 * step.h
         end, after = self._end(z, problem)
         powers = lambda law: [law(x.q, x.v, x.t) @ x.v for x in (step.start, end)]
         work = lambda law: half * sum(powers(law))
@@ -186,13 +179,11 @@ class GeneralizedAlpha(AbstractCarryingSolve[Increment, _AlphaProblem]):
             first, last = before.acceleration, after.acceleration
             drive_work = half * (power(step.start, first) + power(end, last))
         return StepEnd(
-            end,
-            step.h * z.rate,
-            z.impulse / step.h,
-            measured_account(step, end, work, drive_work),
-            None,
-            RESULTS.successful,
-            after,
+            state=end,
+            displacement=step.h * z.rate,
+            multipliers=z.impulse / step.h,
+            energies=step.measured_account(end, work, drive_work),
+            carried=after,
         )
 
     def _end(self, z: Increment, problem: _AlphaProblem) -> tuple[State, _Carried]:
@@ -204,9 +195,9 @@ class GeneralizedAlpha(AbstractCarryingSolve[Increment, _AlphaProblem]):
             lambda x: x.astype(h.dtype), (self.alpha_m, self.alpha_f, self.beta, self.gamma)
         )
         a0 = before.auxiliary
-        shift = model_of(step).reaction_at(start.q, start.t, z.velocity_impulse)
+        shift = step.separable_model.reaction_at(start.q, start.t, z.velocity_impulse)
         a1 = ((z.rate + shift - start.v) / h - (0.5 - beta) * a0) / beta
         mean = (1 - alpha_m) * a1 + alpha_m * a0
         vdot1 = (mean - alpha_f * before.acceleration) / (1 - alpha_f)
         v1 = start.v + h * ((1 - gamma) * a0 + gamma * a1)
-        return State(step.at(z), v1, step.end_time), _Carried(a1, vdot1)
+        return State(step.position(z), v1, step.end_time), _Carried(a1, vdot1)

@@ -4,22 +4,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._discrete import AbstractDerivative, ChainRule
-from .._operators import AbstractModel, Drive, Increment, SeparableModel
+from .._operators import AbstractModel, Gradient, Increment, Reaction
 from .._results import RESULTS
 from .._system import State
-from .._types import JointMultipliers, Multipliers, Scalar, Velocities
-from ._checks import check_derivative
-from ._decaying import (
-    as_alpha,
-    jump_drive,
+from .._types import Multipliers, Scalar, Velocities
+from ._arguments import as_alpha, check_derivative
+from ._discontinuous import (
     jump_energy,
+    jump_gradient,
     jump_loads,
     jump_work,
     JumpAndEnd,
     predict_jump_and_end,
     split_velocities,
 )
-from .base import AbstractSingleSolve, Formulation, StepEnd, StepProblem
+from .base import AbstractOneSolveScheme, Formulation, Node, StepEnd, StepProblem
 
 
 class _Unknowns(eqx.Module):
@@ -28,7 +27,7 @@ class _Unknowns(eqx.Module):
     kappa: Float[Array, " nk"]
 
 
-class KappaDecaying(AbstractSingleSolve[_Unknowns, StepProblem]):
+class KappaDecaying(AbstractOneSolveScheme[_Unknowns, StepProblem]):
     """The paper's decaying scheme with velocity constraints and the parameter kappa.
 
     Like `EnergyDecaying`, but with the velocity-level multipliers interpolated between
@@ -76,7 +75,7 @@ class KappaDecaying(AbstractSingleSolve[_Unknowns, StepProblem]):
         return False
 
     def problem(self, model: AbstractModel, start: State, h: Scalar) -> StepProblem:
-        return StepProblem(model, start, h, self.derivative, "ggl")
+        return StepProblem(model, start, h, self.derivative)
 
     def predict(
         self, problem: StepProblem, acceleration: Velocities, multipliers: Multipliers
@@ -87,31 +86,37 @@ class KappaDecaying(AbstractSingleSolve[_Unknowns, StepProblem]):
 
     def residual(self, z: _Unknowns, problem: StepProblem) -> _Unknowns:
         model, start, h = problem.model, problem.start, problem.h
-        jump, end = self._nodes(z, problem)
         nodes, kappa = z.nodes, _kappa(z)
+        jump_node, end_node = self._nodes(z, problem)
+        jump, end = jump_node.state, end_node.state
         loads = jump_loads(self.alpha, nodes, problem, jump, end)
-        after = problem.drive(jump, end, _position_level(nodes.end)).less(loads.after)
-        before = problem.drive(start, jump, _position_level(nodes.jump)).less(loads.before)
-        work = self._kappa_row(z, problem, jump, end, after, before)
-        gradients = (
-            model.gradient(start, h).less(loads.start),
-            model.gradient(jump, h).less(loads.jump),
+        after = problem.discrete_gradient(jump, end, _position_level(nodes.end))
+        before = problem.discrete_gradient(start, jump, _position_level(nodes.jump))
+        after, before = after.less(loads.after), before.less(loads.before)
+        at_start = model.gradient(start, h).less(loads.start)
+        at_jump = model.gradient(jump, h).less(loads.jump)
+        # Where momenta are unknowns, the reactions are a part of the rows; else they are a
+        # part of the velocities.
+        reaction_jump = model.reaction_row(jump, nodes.jump.velocity_impulse)
+        reaction_end = model.reaction_row(end, nodes.end.velocity_impulse)
+        to_end = _scaled(kappa, after, 0.5 * (reaction_jump + reaction_end))
+        to_jump = jump_gradient(
+            self.alpha,
+            to_end,
+            _scaled(kappa, before, reaction_jump),
+            _scaled(kappa, at_start),
+            _scaled(kappa, at_jump),
         )
-        scaled = [_scaled(kappa, x) for x in (after, before, *gradients)]
-        if model.has_own_momenta:
-            at_jump = model.reaction(jump, _eta(nodes.jump))
-            at_end = model.reaction(end, _eta(nodes.end))
-            scaled[0] = _pushed(scaled[0], 0.5 * (at_jump + at_end))
-            scaled[1] = _pushed(scaled[1], at_jump)
-        to_jump = jump_drive(self.alpha, *scaled)  # eq. (66b)
-        rows = JumpAndEnd(
-            problem.rows(nodes.jump, jump, to_jump),
-            problem.rows(nodes.end, end, scaled[0]),  # eq. (66a)
+        return _Unknowns(
+            nodes=JumpAndEnd(
+                jump=problem.rows(nodes.jump, jump_node, to_jump),  # eq. (66b)
+                end=problem.rows(nodes.end, end_node, to_end),  # eq. (66a)
+            ),
+            kappa=self._kappa_row(z, problem, jump, end, after, before),
         )
-        return _Unknowns(rows, work)
 
     def finish(self, z: _Unknowns, problem: StepProblem) -> StepEnd:
-        jump, end = self._nodes(z, problem)
+        jump, end = (node.state for node in self._nodes(z, problem))
         kinetic, potential = jump_energy(problem, jump)
         kappa = _kappa(z)
         dissipated = self.alpha.astype(kappa.dtype) * (kappa * kinetic + potential)
@@ -120,12 +125,12 @@ class KappaDecaying(AbstractSingleSolve[_Unknowns, StepProblem]):
         # A kappa without value comes from an iterate that broke down for other reasons.
         bounded = ((kappa > 0) & (kappa < 2)) | ~jnp.isfinite(kappa)
         return StepEnd(
-            end,
-            problem.h * z.nodes.end.rate,
-            z.nodes.end.impulse / problem.h,
-            problem.account(dissipated, work, drive_work),
-            kappa,
-            RESULTS.where(bounded, RESULTS.successful, RESULTS.kappa_out_of_range),
+            state=end,
+            displacement=problem.h * z.nodes.end.rate,
+            multipliers=z.nodes.end.impulse / problem.h,
+            energies=problem.account(dissipated, work, drive_work),
+            details=kappa,
+            result=RESULTS.where(bounded, RESULTS.successful, RESULTS.kappa_out_of_range),
         )
 
     def _kappa_row(
@@ -134,62 +139,54 @@ class KappaDecaying(AbstractSingleSolve[_Unknowns, StepProblem]):
         problem: StepProblem,
         jump: State,
         end: State,
-        after: Drive,
-        before: Drive,
+        after: Gradient,
+        before: Gradient,
     ) -> Float[Array, " nk"]:
         """eq. (70, 71), multiplied out, over an energy of the step."""
         if z.kappa.size == 0:
             return z.kappa
-        model, v0 = problem.model, problem.start.v
-        if isinstance(model, SeparableModel):
-            change = model.kinetic_of(end.v) - model.kinetic_of(v0)
-        else:
-            change = after.drift @ (end.v - jump.v) + before.drift @ (jump.v - v0)
+        model, start = problem.model, problem.start
+        change = model.kinetic_change(jump, end, after)
+        change = change + model.kinetic_change(start, jump, before)
         rate = lambda state, dv: jax.jvp(
             lambda v: model.joint_rate(state.q, v, state.t), (state.v,), (dv,)
         )[1]
-        at_jump = rate(jump, end.v + jump.v - 2 * v0)
+        at_jump = rate(jump, end.v + jump.v - 2 * start.v)
         at_end = rate(end, end.v - jump.v)
-        work = _eta(z.nodes.jump) @ at_jump + _eta(z.nodes.end) @ at_end
-        scale = model.energy_scale(problem.start, problem.h)
+        jump_eta, end_eta = z.nodes.jump.velocity_impulse, z.nodes.end.velocity_impulse
+        work = jump_eta @ at_jump + end_eta @ at_end
+        scale = model.energy_scale(start, problem.h)
         return ((z.kappa - 1) * change + 0.5 * work) / scale
 
-    def _nodes(self, z: _Unknowns, problem: StepProblem) -> tuple[State, State]:
-        model, q0, kappa = problem.model, problem.start.q, _kappa(z)
+    def _nodes(self, z: _Unknowns, problem: StepProblem) -> tuple[Node, ...]:
+        """The nodes after the jump, which takes no time, and at the end."""
+        model, start, kappa = problem.model, problem.start, _kappa(z)
         jump, end = z.nodes.jump, z.nodes.end
-        t0, t1 = problem.start.t, problem.end_time
-        if not isinstance(model, SeparableModel):
-            return problem.node(jump, t0), problem.node(end, t1)
-        qj, q1 = problem.at(jump), problem.at(end)
-        at_jump = model.reaction_at(qj, t0, _eta(jump))
-        at_end = model.reaction_at(q1, t1, _eta(end))
-        vj, v1 = split_velocities(
-            self.alpha,
-            problem.start.v,
-            # eq. (66c): vj + v1
-            (2 * problem.velocity(end) - (at_jump + at_end)) / kappa,
-            # eq. (66d)
-            -(6 * model.push(q0, qj, jump.rate) + (at_end - at_jump)) / kappa,
-        )
-        return State(qj, vj, t0), State(q1, v1, t1)
+        qj, q1 = problem.position(jump), problem.position(end)
+        t0, t1 = start.t, problem.end_time
+
+        def velocities(reaction: Reaction) -> tuple[Velocities, Velocities]:
+            at_jump = reaction(qj, t0, jump.velocity_impulse)
+            at_end = reaction(q1, t1, end.velocity_impulse)
+            # eq. (66c): vj + v1, and eq. (66d)
+            total = 2 * problem.velocity(end) - (at_jump + at_end)
+            difference = -(6 * model.push(start.q, qj, jump.rate) + (at_end - at_jump))
+            return split_velocities(self.alpha, start.v, total / kappa, difference / kappa)
+
+        return problem.nodes(velocities, (jump, t0), (end, t1))
 
 
 def _kappa(z: _Unknowns) -> Scalar:
     return z.kappa[0] if z.kappa.size == 1 else jnp.ones((), z.kappa.dtype)
 
 
-def _eta(increment: Increment) -> JointMultipliers:
-    return increment.velocity_impulse
-
-
 def _position_level(increment: Increment) -> Increment:
-    """Without the velocity-level multipliers: in this scheme they drive no momentum."""
-    return eqx.tree_at(_eta, increment, _eta(increment)[:0])
+    """Without the velocity-level multipliers, which do not enter the balance of momentum
+    in this scheme."""
+    eta = increment.velocity_impulse
+    return eqx.tree_at(lambda z: z.velocity_impulse, increment, eta[:0])
 
 
-def _scaled(kappa: Scalar, drive: Drive) -> Drive:
-    return Drive(drive.impulse, kappa * drive.drift)
-
-
-def _pushed(drive: Drive, velocity: Velocities) -> Drive:
-    return Drive(drive.impulse, drive.drift + velocity)
+def _scaled(kappa: Scalar, gradient: Gradient, reaction: Velocities | float = 0.0):
+    """A gradient with `kappa` times its rate, and a reaction added to that."""
+    return Gradient(gradient.impulse, kappa * gradient.rate + reaction)

@@ -1,20 +1,12 @@
 import equinox as eqx
 
 from .._operators import AbstractModel, Increment
-from .._results import RESULTS
 from .._system import State
 from .._types import Coordinates, Multipliers, Scalar, Velocities
-from ._baseline import (
-    balance_rows,
-    measured_account,
-    model_of,
-    plain_problem,
-    reaction_force,
-)
-from .base import AbstractSingleSolve, Formulation, StepEnd, StepProblem
+from .base import AbstractOneSolveScheme, Formulation, StepEnd, StepProblem
 
 
-class Rattle(AbstractSingleSolve[Increment, StepProblem]):
+class Rattle(AbstractOneSolveScheme[Increment, StepProblem]):
     """RATTLE: the leapfrog (Stormer-Verlet) scheme on the constraints; for comparison.
 
     With `V` for velocities half-way and `F = -dV/dq + f`,
@@ -52,7 +44,7 @@ class Rattle(AbstractSingleSolve[Increment, StepProblem]):
         return True
 
     def problem(self, model: AbstractModel, start: State, h: Scalar) -> StepProblem:
-        return plain_problem("Rattle", model, start, h, "ggl")
+        return StepProblem.with_constant_inertia("Rattle", model, start, h)
 
     def predict(
         self, problem: StepProblem, acceleration: Velocities, multipliers: Multipliers
@@ -64,28 +56,26 @@ class Rattle(AbstractSingleSolve[Increment, StepProblem]):
     def residual(self, z: Increment, problem: StepProblem) -> Increment:
         start, middle = problem.start, z.rate
         pulled = self._pulled(problem, start.q, middle, start.t, z.impulse)
-        balance = model_of(problem).inertia @ (middle - start.v) + 0.5 * pulled
-        return balance_rows(problem, balance, z, self._end(z, problem))
+        balance = problem.separable_model.inertia @ (middle - start.v) + 0.5 * pulled
+        return problem.rows_of_balance(balance, self._end(z, problem))
 
     def finish(self, z: Increment, problem: StepProblem) -> StepEnd:
         end = self._end(z, problem)
-        # Of the forces of both ends, over the way of the step.
+        # The mean of the forces at both ends, times the displacement.
         at_ends = lambda law: [law(x.q, z.rate, x.t) for x in (problem.start, end)]
         work = lambda law: 0.5 * problem.h * sum(at_ends(law)) @ z.rate
         drive_work = self._drive_work(z, problem, end)
         return StepEnd(
-            end,
-            problem.h * z.rate,
-            0.5 * (z.impulse + z.velocity_impulse) / problem.h,
-            measured_account(problem, end, work, drive_work),
-            None,
-            RESULTS.successful,
+            state=end,
+            displacement=problem.h * z.rate,
+            multipliers=0.5 * (z.impulse + z.velocity_impulse) / problem.h,
+            energies=problem.measured_account(end, work, drive_work),
         )
 
     def _end(self, z: Increment, problem: StepProblem) -> State:
-        q1, t1 = problem.at(z), problem.end_time
+        q1, t1 = problem.position(z), problem.end_time
         pulled = self._pulled(problem, q1, z.rate, t1, z.velocity_impulse)
-        v1 = z.rate - 0.5 * (model_of(problem).inverse_inertia @ pulled)
+        v1 = z.rate - 0.5 * (problem.separable_model.inverse_inertia @ pulled)
         return State(q1, v1, t1)
 
     def _pulled(
@@ -99,13 +89,13 @@ class Rattle(AbstractSingleSolve[Increment, StepProblem]):
         """`-h (F - B^T lambda)` at one end of the step."""
         model = problem.model
         slope = model.slope(State(q, middle, t))
-        return problem.h * slope + reaction_force(model, q, t, impulse)
+        return problem.h * slope + model.constraint_force(q, t, impulse)
 
     def _drive_work(self, z: Increment, problem: StepProblem, end: State) -> Scalar | None:
-        """That of all reactions: those of joints that do not move do none."""
+        """The work of all reactions, because those of joints at rest do none."""
         model, start = problem.model, problem.start
         if model.system.driven is None:
             return None
-        before = reaction_force(model, start.q, start.t, z.impulse)
-        after = reaction_force(model, end.q, end.t, z.velocity_impulse)
+        before = model.constraint_force(start.q, start.t, z.impulse)
+        after = model.constraint_force(end.q, end.t, z.velocity_impulse)
         return -0.5 * (before + after) @ z.rate

@@ -62,10 +62,10 @@ class Linearisable(eqx.Module):
     value: Callable[[Float[Array, " n"]], Float[Array, " n"]]
     form: Full | Band | Scattered
     # Added to the diagonal of a Jacobian that may be singular.
-    fill: Float[Array, " n"] | None
-    # For a point what stands for the function there, if only the corrections of a search
-    # are solved with its Jacobian.
-    near: Callable[[Array], Callable[[Array], Array]] | None = None
+    regularisation: Float[Array, " n"] | None
+    # A function whose Jacobian approximates that of `value`, where a search is to be done
+    # with it.
+    jacobian_of: Callable[[Float[Array, " n"]], Float[Array, " n"]] | None = None
 
     @property
     def is_dense(self) -> bool:
@@ -75,7 +75,7 @@ class Linearisable(eqx.Module):
     @property
     def is_exact(self) -> bool:
         """Whether `jacobian` is that of `value`."""
-        return self.near is None
+        return self.jacobian_of is None
 
     @property
     def keeps_factors(self) -> bool:
@@ -84,11 +84,11 @@ class Linearisable(eqx.Module):
 
     def jacobian(self, x: Float[Array, " n"]) -> Array:
         """The Jacobian, in the form that `first_factors` are renewed with."""
-        fill = self.fill
-        value = self.value if self.near is None else self.near(x)
-        if fill is None:
+        regularisation = self.regularisation
+        value = self.value if self.jacobian_of is None else self.jacobian_of
+        if regularisation is None:
             return self.form.evaluate(value, x)
-        return self.form.evaluate(lambda x: value(x) + fill * x, x)
+        return self.form.evaluate(lambda x: value(x) + regularisation * x, x)
 
     def first_factors(
         self, kept: AbstractFactors | None, x: Float[Array, " n"]
@@ -101,41 +101,50 @@ class Linearisable(eqx.Module):
     def solve(self, x: Float[Array, " n"], right: Float[Array, " n"]) -> Array:
         """`J(x)^-1 right`, differentiable in all there is, and transposable in `right`.
 
-        Of a singular Jacobian with a `fill` the solution without part in its null space.
+        For a singular Jacobian with a `regularisation` this is the solution that has no
+        part in its null space.
         """
-        solve = self.filled_solver(x)
+        solve = self.regularised_solver(x)
         first = solve(right)
-        # What a fill has changed is taken back, but for its square.
-        return first if self.fill is None else first + solve(self.fill * first)
+        # What a regularisation has changed is taken back, but for its square.
+        return (
+            first
+            if self.regularisation is None
+            else first + solve(self.regularisation * first)
+        )
 
     def open_part(
         self, solve: Callable[[Array], Array], x: Float[Array, " n"]
     ) -> Float[Array, " n"]:
-        """The part of `x` in the null space of the Jacobian that `solve` solves with,
-        filled.
+        """The part of `x` in the null space of the Jacobian.
 
-        Of the rest only the square of what a fill changes is left. Unknowns without a fill
-        are determined: they have no such part.
+        `solve` solves with the regularised Jacobian.
+        The error is of second order in the regularisation. Unknowns without a
+        regularisation are determined by the equations and have no such part.
         """
-        assert self.fill is not None
-        return jnp.where(self.fill == 0, 0, solve(self.fill * solve(self.fill * x)))
+        assert self.regularisation is not None
+        return jnp.where(
+            self.regularisation == 0,
+            0,
+            solve(self.regularisation * solve(self.regularisation * x)),
+        )
 
-    def filled_solver(self, x: Float[Array, " n"]) -> Callable[[Array], Array]:
+    def regularised_solver(self, x: Float[Array, " n"]) -> Callable[[Array], Array]:
         """Solves with the Jacobian at `x`, filled."""
-        if self.is_dense and self.fill is None and x.size <= SMALL:
+        if self.is_dense and self.regularisation is None and x.size <= SMALL:
             found = in_one_function(lambda x: inverse(self.jacobian(x)))(x)
             return lambda right: found @ right
         matrix = self.jacobian(x)
         if self.is_dense:
             # An explicit inverse loses too many digits of what is nearly singular.
-            by = solve if self.fill is None else jnp.linalg.solve
+            by = solve if self.regularisation is None else jnp.linalg.solve
             return lambda right: by(matrix, right)
         matrix = jax.lax.stop_gradient(matrix)
         factors = self.form.empty(x.size, x.dtype).renewed(matrix)
 
         def product(t: Array) -> Array:
             image = jax.jvp(self.value, (x,), (t,))[1]
-            return image if self.fill is None else image + self.fill * t
+            return image if self.regularisation is None else image + self.regularisation * t
 
         return lambda right: jax.lax.custom_linear_solve(
             product,
@@ -151,60 +160,64 @@ def linearisable(
     like: Float[Array, " n"],
     args: Any,
     linear_solver: lx.AbstractLinearSolver | KLU | None = None,
-    fill: Float[Array, " n"] | None = None,
+    regularisation: Float[Array, " n"] | None = None,
 ) -> Linearisable:
     """`fn(x, args)` as a function of `x`; what it depends on must be in `args`.
 
-    Without a `linear_solver` the size and the structure of the Jacobian decide. `fill` is
-    added to its diagonal where it may be singular.
+    Without a `linear_solver` the size and the structure of the Jacobian decide. The
+    `regularisation` is added to its diagonal where it may be singular.
     """
     value = plain_products(fn, like, args)
     if isinstance(linear_solver, lx.AbstractLinearSolver):
-        return Linearisable(value, Full(linear_solver), fill)
-    filled = value if fill is None else lambda x: value(x) + fill * x
+        return Linearisable(value, Full(linear_solver), regularisation)
+    filled = value if regularisation is None else lambda x: value(x) + regularisation * x
     pattern = jacobian_pattern(filled, like) if like.size > LARGE else None
     if pattern is None:
-        return Linearisable(value, Full(None), fill)
+        return Linearisable(value, Full(None), regularisation)
     if isinstance(linear_solver, KLU):
-        return Linearisable(value, Scattered(pattern), fill)
+        return Linearisable(value, Scattered(pattern), regularisation)
     band = Band(pattern)
     form = band if band.worth_it() else Full(None, pattern)
-    return Linearisable(value, form, fill)
+    return Linearisable(value, form, regularisation)
 
 
 def affine_root(
     fn: Callable[[Array], Array],
     like: Float[Array, " n"],
-    fill: Float[Array, " n"] | None = None,
+    regularisation: Float[Array, " n"] | None = None,
 ) -> Float[Array, " n"]:
     """Where an affine function vanishes; differentiable in what it closes over.
 
-    With a `fill`, which is added to the diagonal, it need not be regular.
+    With a `regularisation`, which is added to the diagonal, it need not be regular.
     """
     at = jnp.zeros_like(like)
-    linear = linearisable(lambda x, _: fn(x), at, None, fill=fill)
-    if linear.is_dense and fill is None:
+    linear = linearisable(lambda x, _: fn(x), at, None, regularisation=regularisation)
+    if linear.is_dense and regularisation is None:
         return -jnp.linalg.solve(linear.jacobian(at), linear.value(at))
     return -linear.solve(at, linear.value(at))
 
 
 def narrowed(
     exact: Linearisable,
-    simplified: Callable[[Array, tuple[Array, PyTree]], Array],
+    jacobian_of: Callable[[Array, PyTree], Array],
     like: Float[Array, " n"],
     args: Any,
 ) -> Linearisable | None:
-    """The same function with the Jacobian of `simplified(x, (x, args))` in the first `x`.
+    """The same function with the Jacobian of `jacobian_of(x, args)` in place of its own.
 
-    `None` where that is no narrower band: then nothing is gained.
+    `None` where that is no narrower band, because then nothing is gained.
     """
-    band = linearisable(simplified, like, (like, args), fill=exact.fill).form
-    if not isinstance(band, Band):
+    narrow = linearisable(jacobian_of, like, args, regularisation=exact.regularisation)
+    if not isinstance(narrow.form, Band):
         return None
-    if isinstance(exact.form, Band) and band.width >= exact.form.width:
+    if isinstance(exact.form, Band) and narrow.form.width >= exact.form.width:
         return None
-    near = lambda held: plain_products(simplified, like, (held, args))
-    return Linearisable(exact.value, band, exact.fill, near)
+    return Linearisable(
+        value=exact.value,
+        form=narrow.form,
+        regularisation=exact.regularisation,
+        jacobian_of=narrow.value,
+    )
 
 
 class RowPattern:

@@ -146,7 +146,7 @@ def _balance(system: AbstractSystem, states: State, args: Args):
         if not system.is_timed:
             state = State(state.q, state.v)
         model = make_model(system, state, args)
-        inner = model.enter(state)
+        inner = model.to_internal(state)
         return model.accelerations(inner)[1], system.energy(state, args)
 
     return jax.vmap(at)(states)

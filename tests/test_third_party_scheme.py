@@ -1,0 +1,111 @@
+"""A scheme outside of the package that is written with public names is like all others."""
+
+import ast
+import pathlib
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import enerjax as ej
+
+from .helpers import EPS, problem
+from .midpoint_scheme import Midpoint
+
+
+HERE = pathlib.Path(__file__).parent
+STEPS, DURATION = (32, 64, 128), 0.5
+
+
+def tip(g, h):
+    system, start, args = problem("pendulum")
+    world = args | {"g": g}
+    run = ej.simulate(system, Midpoint(), start, world, h=h, num_steps=20)
+    return run.ys.q[-1, 0]
+
+
+def test_it_imports_public_names_alone():
+    tree = ast.parse((HERE / "midpoint_scheme.py").read_text())
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    assert {node.module for node in imports} == {"enerjax", "enerjax.schemes", "jax"}
+    names = [alias.name for node in imports for alias in node.names]
+    assert not any(name.startswith("_") for name in names)
+
+
+def test_the_tutorial_shows_this_file():
+    text = (HERE.parent / "docs" / "write-your-own-scheme.md").read_text()
+    blocks = re.findall(r"^```python[^\n]*\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    assert (HERE / "midpoint_scheme.py").read_text() in blocks
+
+
+def test_its_order_is_two_with_constraints():
+    """Against the library's scheme of order 4, whose order other tests establish."""
+    table = ej.order_table(
+        ej.problems.double_pendulum(),
+        {"midpoint": Midpoint()},
+        STEPS,
+        ej.EnergyConsistent(0.0),
+        duration=DURATION,
+    )
+    for slopes in (table.order_q, table.order_v):
+        assert np.all(np.abs(slopes - 2) < 0.1)  # truncation
+
+
+def test_a_quadratic_energy_is_conserved_and_constraints_hold():
+    mass, spring = jnp.array([1.0, 2.0]), jnp.array([[3.0, -1.0], [-1.0, 2.0]])
+    system = ej.System(
+        lambda v, args: 0.5 * mass @ v**2, lambda q, args: 0.5 * q @ spring @ q
+    )
+    start = ej.initial_state(system, [0.4, -0.2], [0.1, 0.3])
+    audit = ej.simulate(system, Midpoint(), start, h=0.2, num_steps=50).audit
+    assert np.ptp(audit.energy) <= 100 * EPS * audit.energy[0]  # round-off
+    system, start, args = problem("pendulum")
+    audit = ej.simulate(system, Midpoint(), start, args, h=0.01, num_steps=50).audit
+    assert np.max(np.abs(audit.constraint)) <= 100 * EPS  # round-off
+    assert np.max(np.abs(audit.constraint_rate)) <= 1e3 * EPS  # round-off, over h
+    # Not an energy-consistent scheme: what it loses or gains is told as `dissipated`.
+    assert 1e-9 < np.max(np.abs(audit.dissipated)) < 1e-3
+    assert np.max(np.abs(audit.leak)) <= 1e3 * EPS * np.max(audit.kinetic)
+
+
+def test_a_hamiltonian_gives_the_motion_of_constant_inertia():
+    energy = lambda q, p, args: 0.5 * p @ p / args["m"] + args["m"] * args["g"] * q[1]
+    rod = lambda q, args: jnp.array([q @ q - 1.0])
+    system = ej.System.from_hamiltonian(energy, rod)
+    same = ej.System(
+        lambda v, args: 0.5 * args["m"] * v @ v,
+        lambda q, args: args["m"] * args["g"] * q[1],
+        rod,
+    )
+    args = dict(m=2.0, g=9.81)
+    ends = []
+    for each in (system, same):
+        start = ej.initial_state(each, [1.0, 0.0], [0.0, 0.0], args)
+        run = ej.simulate(each, Midpoint(), start, args, h=0.01, num_steps=40)
+        ends.append(run.ys.q[-1])
+    np.testing.assert_allclose(*ends, rtol=1e-11)  # round-off, grown over the steps
+
+
+def test_it_is_differentiated_and_mapped():
+    reverse = jax.jit(jax.grad(tip))(9.81, 0.01)
+    eps = 1e-5
+    differences = (tip(9.81 + eps, 0.01) - tip(9.81 - eps, 0.01)) / (2 * eps)
+    # Truncation and round-off of the differences.
+    assert reverse == pytest.approx(float(differences), rel=1e-7)
+    gs, hs = jnp.array([5.0, 9.81]), jnp.array([0.01, 0.02])
+    lanes = jax.vmap(jax.vmap(tip, (0, None)), (None, 0))(gs, hs)
+    alone = [[tip(g, h) for g in gs] for h in hs]
+    np.testing.assert_allclose(lanes, alone, rtol=1e-12)
+
+
+def test_it_can_be_composed():
+    table = ej.order_table(
+        ej.problems.double_pendulum(),
+        {"composed": ej.Composed(Midpoint(), 4)},
+        (16, 32),
+        ej.EnergyConsistent(0.0),
+        duration=DURATION,
+    )
+    assert table.order_q[0, 0] > 3.7  # truncation
