@@ -53,7 +53,7 @@ def initial_state(
     it satisfies them to round-off already.
     """
     known = known_q, known_v
-    return _nearest(system, State(q, v), args, t, known, firmly=True, throw=throw)
+    return _nearest(system, State(q, v), args, t, known, keep_known=True, throw=throw)
 
 
 def consistent_start(
@@ -96,15 +96,14 @@ def consistent_start(
     independent at the start, with their rank.
     """
     known = known_q, known_v
-    return _start(system, State(q, v), args, t, known, firmly=True, throw=throw)
+    return _start(system, State(q, v), args, t, known, keep_known=True, throw=throw)
 
 
 def start_near(
     system: AbstractSystem, state: State, args: Args, t: Real, known_v: Sequence[int]
 ) -> State:
-    """As `initial_state`, but known velocities give way where the joints do not admit
-    them."""
-    return _nearest(system, state, args, t, ((), known_v), firmly=False, throw=True)
+    """As `initial_state`, but known velocities change where joints do not admit them."""
+    return _nearest(system, state, args, t, ((), known_v), keep_known=False, throw=True)
 
 
 def _nearest(
@@ -114,7 +113,7 @@ def _nearest(
     t: Real,
     known: tuple[Sequence[int], Sequence[int]],
     *,
-    firmly: bool,
+    keep_known: bool,
     throw: bool,
 ) -> State:
     given, checked = check_system(system, state, args, t)
@@ -123,7 +122,7 @@ def _nearest(
         # A small program spares the compilation of a large one.
         if is_known(met) and met:
             return State(given.q, given.v)
-    return _start(system, state, args, t, known, firmly=firmly, throw=throw).state
+    return _start(system, state, args, t, known, keep_known=keep_known, throw=throw).state
 
 
 def _start(
@@ -133,7 +132,7 @@ def _start(
     t: Real,
     known: tuple[Sequence[int], Sequence[int]],
     *,
-    firmly: bool,
+    keep_known: bool,
     throw: bool,
 ) -> ConsistentStart:
     state, args = check_system(system, state, args, t)
@@ -145,10 +144,10 @@ def _start(
     start, near, kept, rank = _project(system, state, args, known)
     if not throw:
         independent = system.redundant | (rank == start.multipliers.size)
-        good = (near & kept if firmly else near) & independent
+        good = (near & kept if keep_known else near) & independent
         return jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), start)
     start = _raise_unless(
-        near & kept if firmly else near,
+        near & kept if keep_known else near,
         start,
         "The start is too far from the constraints to be repaired: their linearisation "
         "does not explain the error, so the nearest admissible configuration may not be "

@@ -178,10 +178,15 @@ def _predicted(memory: Memory) -> PyTree[Any]:
     Smooth motion is met by extrapolation; where it changes quickly the last step is the
     better guess. What would have been better for the step before decides.
     """
-    smooth = jax.tree.map(_next, memory.added)
-    last = jax.tree.map(lambda x: x[0], memory.added)
+    smooth, last = _candidates(memory)
     choose = lambda x, y: jnp.where(memory.is_smooth, x, y)
     return jax.tree.map(choose, smooth, last)
+
+
+def _candidates(memory: Memory) -> tuple[PyTree[Any], PyTree[Any]]:
+    """What a step may add to a free flight: the extrapolation, and the last step again."""
+    smooth = jax.tree.map(_next, memory.added)
+    return smooth, jax.tree.map(lambda x: x[0], memory.added)
 
 
 def _memory_after(
@@ -197,8 +202,7 @@ def _memory_after(
         difference = lambda x, y, unit: (x - y) / unit
         return max_norm(jax.tree.map(difference, added, guess, unknown_scale))
 
-    smooth = jax.tree.map(_next, memory.added)
-    last = jax.tree.map(lambda x: x[0], memory.added)
+    smooth, last = _candidates(memory)
     return Memory(
         added=jax.tree.map(_pushed, added, memory.added),
         is_smooth=error(smooth) <= error(last),

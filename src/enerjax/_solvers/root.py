@@ -77,14 +77,14 @@ def _turned(
     """
     moved, fixed = parts
 
-    def filled(moved: PyTree, at: Array) -> Array:
+    def regularised(moved: PyTree, at: Array) -> Array:
         args = eqx.combine(moved, fixed)
         return fn(at, args) + ravel_pytree(args[-1])[0] * at
 
     assert linear.regularisation is not None
     solve = linear.regularised_solver(root)
     regular = root - solve(linear.regularisation * root)
-    _, rate = jax.jvp(lambda moved: filled(moved, regular), (moved,), (t_args,))
+    _, rate = jax.jvp(lambda moved: regularised(moved, regular), (moved,), (t_args,))
     return linear.open_part(solve, linear.regularised_solver(regular)(-rate))
 
 

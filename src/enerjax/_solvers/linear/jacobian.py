@@ -130,7 +130,7 @@ class Linearisable(eqx.Module):
         )
 
     def regularised_solver(self, x: Float[Array, " n"]) -> Callable[[Array], Array]:
-        """Solves with the Jacobian at `x`, filled."""
+        """A function that solves with the regularised Jacobian at `x`."""
         if self.is_dense and self.regularisation is None and x.size <= SMALL:
             found = in_one_function(lambda x: inverse(self.jacobian(x)))(x)
             return lambda right: found @ right
@@ -170,8 +170,10 @@ def linearisable(
     value = plain_products(fn, like, args)
     if isinstance(linear_solver, lx.AbstractLinearSolver):
         return Linearisable(value, Full(linear_solver), regularisation)
-    filled = value if regularisation is None else lambda x: value(x) + regularisation * x
-    pattern = jacobian_pattern(filled, like) if like.size > LARGE else None
+    regularised = (
+        value if regularisation is None else lambda x: value(x) + regularisation * x
+    )
+    pattern = jacobian_pattern(regularised, like) if like.size > LARGE else None
     if pattern is None:
         return Linearisable(value, Full(None), regularisation)
     if isinstance(linear_solver, KLU):
