@@ -11,6 +11,7 @@ adaptive.json and adaptive.png.
 """
 
 import csv
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -94,17 +95,12 @@ def our_rows(quick: bool) -> list[harness.Row]:
             if quick and name != "EnergyConsistent(0.0)":
                 continue
 
-            def run(h, controller, scheme=scheme, system=system, start=start, args=args):
+            def run(h, controller, mechanism=(system, scheme, start, args), t1=t1, ts=ts):
                 is_fixed = isinstance(controller, ej.EqualSteps)
                 bound = COUNTS[-1] if is_fixed else MAX_STEPS
-                return ej.simulate(
-                    system,
-                    scheme,
-                    start,
-                    args,
-                    h=h,
-                    t1=t1,  # noqa: B023
-                    saveat=ej.SaveAt(ts=ts),  # noqa: B023
+                run = functools.partial(ej.simulate, *mechanism, h=h, t1=t1)
+                return run(
+                    saveat=ej.SaveAt(ts=ts),
                     max_steps=bound,
                     controller=controller,
                     throw=False,

@@ -136,12 +136,12 @@ def measure(
         runs = [run(case, problem, method, reference, 2**k) for k in range(levels)]
         rows.append(
             Row(
-                case,
-                method,
-                runs,
+                case=case,
+                method=method,
+                runs=runs,
                 # The reference, and sums of rounded steps, resolve no less than this.
-                slopes(runs, "error_q", max(2 * reference.uncertainty_q, 1e-12)),
-                slopes(runs, "error_v", max(2 * reference.uncertainty_v, 1e-12)),
+                slopes_q=slopes(runs, "error_q", max(2 * reference.uncertainty_q, 1e-12)),
+                slopes_v=slopes(runs, "error_v", max(2 * reference.uncertainty_v, 1e-12)),
             )
         )
     return rows

@@ -12,12 +12,11 @@ extremes.png.
 """
 
 import argparse
-import csv
-import dataclasses
 import time
 from itertools import chain, groupby
 from pathlib import Path
 
+import harness
 import jax
 import numpy as np
 from matplotlib.figure import Figure
@@ -57,14 +56,6 @@ def show(rows: list) -> None:
                     r.happened,
                 )
             )  # fmt: skip
-
-
-def write_csv(rows: list, path: Path) -> None:
-    with path.open("w", newline="") as file:
-        names = [field.name for field in dataclasses.fields(rows[0])]
-        writer = csv.DictWriter(file, names)
-        writer.writeheader()
-        writer.writerows(dataclasses.asdict(row) for row in rows)
 
 
 COLOURS = {"right": "C2", "law holds": "C0", "reported failure": "C1", "WRONG": "C3"}
@@ -118,7 +109,7 @@ def main(arguments: list[str] | None = None) -> None:
         rows += found
         jax.clear_caches()
     rows.sort(key=lambda row: row.axis)
-    write_csv(rows, options.out / "extremes.csv")
+    harness.write_csv(rows, options.out / "extremes.csv")
     draw(rows, options.out / "extremes.png")
     for verdict in COLOURS:
         print(f"{verdict}: {sum(row.verdict == verdict for row in rows)}")

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import harness
 import jax
 import numpy as np
 from numpy.typing import NDArray
@@ -62,16 +63,7 @@ def run(
     problem: Problem, scheme: ej.AbstractScheme, h: float, steps: int, save_every: int = 1
 ) -> ej.Solution:
     system, start, args = problem
-    return ej.simulate(
-        system,
-        scheme,
-        start,
-        args,
-        h=h,
-        num_steps=steps,
-        saveat=ej.SaveAt(every=save_every),
-        throw=False,
-    )
+    return harness.run_of(system, scheme, steps, every=save_every)(start, args, h)
 
 
 def judge(
@@ -104,15 +96,15 @@ def judge(
     iterations = np.asarray(solution.stats.newton_iterations)
     return Row(
         *place,
-        f"step {done + 1}: {cause.partition('.')[0]}" if failed else "success",
-        error,
-        allowed if error_of is not None else np.nan,
-        leak,
-        _largest(audit.constraint[good]),
-        _largest(audit.constraint_rate[good]),
-        float(np.mean(iterations[: max(done, 1)])),
-        float(solution.phase_error),
-        verdict,
+        happened=f"step {done + 1}: {cause.partition('.')[0]}" if failed else "success",
+        error=error,
+        allowed=allowed if error_of is not None else np.nan,
+        leak=leak,
+        constraint=_largest(audit.constraint[good]),
+        constraint_rate=_largest(audit.constraint_rate[good]),
+        newton=float(np.mean(iterations[: max(done, 1)])),
+        phase=float(solution.phase_error),
+        verdict=verdict,
     )
 
 

@@ -50,13 +50,22 @@ def block(kind: str, seed: int, number: int) -> Iterator[Done]:
         except StopIteration:
             break
         except Exception as error:
-            yield Done(kind, seed, number, -1, "no case", crash(error))
+            yield Done(
+                kind=kind,
+                seed=seed,
+                block=number,
+                case=-1,
+                label="no case",
+                result=crash(error),
+            )
             break
         try:
             result = check()
         except Exception as error:
             result = crash(error)
-        yield Done(kind, seed, number, case, label, result)
+        yield Done(
+            kind=kind, seed=seed, block=number, case=case, label=label, result=result
+        )
     # A process can map only so many programs.
     jax.clear_caches()
 

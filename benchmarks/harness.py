@@ -5,6 +5,8 @@ its settings only once; the child prints its rows as the last line of its output
 """
 
 import argparse
+import csv
+import dataclasses
 import json
 import os
 import statistics
@@ -106,6 +108,15 @@ def _children(script: str, flags: list[str], modes: Sequence[str]) -> list[Row]:
     return rows
 
 
+def write_csv(rows: Sequence[Any], path: Path) -> None:
+    """A table of dataclasses of one kind."""
+    with path.open("w", newline="") as file:
+        names = [field.name for field in dataclasses.fields(rows[0])]
+        writer = csv.DictWriter(file, names)
+        writer.writeheader()
+        writer.writerows(dataclasses.asdict(row) for row in rows)
+
+
 def device() -> Row:
     first = jax.devices()[0]
     return dict(platform=first.platform, device=first.device_kind)
@@ -123,6 +134,24 @@ def compiled(fn: Callable, *args: Any) -> tuple[Any, float]:
     begin = clock()
     program = jax.jit(fn).lower(*args).compile()
     return program, clock() - begin
+
+
+def run_of(
+    system: ej.AbstractSystem,
+    scheme: ej.AbstractScheme,
+    steps: int,
+    *,
+    every: int | None = None,
+) -> Callable[..., ej.Solution]:
+    """The run of `(start, args, h)` with `steps` steps, saved `every` so many of them or
+    at its end. A run that fails ends with its last state: who calls looks at the error."""
+
+    def run(start: ej.State, args: Any, h: Any) -> ej.Solution:
+        saveat = ej.SaveAt(every=steps if every is None else every)
+        mechanism = (system, scheme, start, args)
+        return ej.simulate(*mechanism, h=h, num_steps=steps, saveat=saveat, throw=False)
+
+    return run
 
 
 def medians(programs: Sequence[Callable[[], Any]], repeats: int) -> list[float]:

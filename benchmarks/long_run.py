@@ -55,19 +55,7 @@ def our_rows(quick: bool) -> list[harness.Row]:
         )
         system, start, args = problem
         steps = round(end / h)
-        scheme = make()
-
-        def run(start, args, h, system=system, scheme=scheme, steps=steps):
-            return ej.simulate(
-                system,
-                scheme,
-                start,
-                args,
-                h=h,
-                num_steps=steps,
-                saveat=ej.SaveAt(every=steps // SAVES),
-            )
-
+        run = harness.run_of(system, make(), steps, every=steps // SAVES)
         program, _ = harness.compiled(run, start, args, h)
         begin = harness.clock()
         audit = jax.block_until_ready(program(start, args, h)).audit

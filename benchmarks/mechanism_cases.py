@@ -115,7 +115,14 @@ def _case(
 ) -> Case:
     name = problem.__name__
     published = published or _data(name, num_positions)
-    return Case(name, problem, block, steps, observe, published)
+    return Case(
+        name=name,
+        problem=problem,
+        block=block,
+        steps=steps,
+        observe=observe,
+        published=published,
+    )
 
 
 CASES = (

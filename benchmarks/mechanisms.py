@@ -10,7 +10,6 @@ scheme leave unexplained. Writes mechanisms.csv and mechanisms.png.
 """
 
 import argparse
-import csv
 import dataclasses
 import sys
 import time
@@ -18,6 +17,7 @@ from concurrent.futures import as_completed, ThreadPoolExecutor
 from itertools import groupby
 from pathlib import Path
 
+import harness
 import jax
 import numpy as np
 from matplotlib.figure import Figure
@@ -100,10 +100,20 @@ def _run(case, problem, name: str, scheme: ej.AbstractScheme, finer: int) -> Row
     leaks, lost, constraint, rate, newton = np.array(parts).T
     error_q, error_v = np.max(errors, axis=0) if not failed else (np.nan, np.nan)
     return Row(
-        case.name, name, h, end, error_q, error_v, np.nan, np.nan,
-        np.max(np.abs(np.cumsum(leaks))) / kinetic, np.sum(lost) / kinetic,
-        np.max(constraint), np.max(rate), np.mean(newton),
-    )  # fmt: skip
+        problem=case.name,
+        scheme=name,
+        h=h,
+        end=end,
+        error_q=error_q,
+        error_v=error_v,
+        order_q=np.nan,
+        order_v=np.nan,
+        balance=np.max(np.abs(np.cumsum(leaks))) / kinetic,
+        dissipated=np.sum(lost) / kinetic,
+        constraint=np.max(constraint),
+        constraint_rate=np.max(rate),
+        newton=np.mean(newton),
+    )
 
 
 def _largest(x: jax.Array) -> float:
@@ -129,13 +139,6 @@ def show(rows: list[Row]) -> None:
                     *orders, *small, *held, f"{r.newton:.2f}",
                 )
             )  # fmt: skip
-
-
-def write_csv(rows: list[Row], path: Path) -> None:
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [field.name for field in dataclasses.fields(Row)])
-        writer.writeheader()
-        writer.writerows(dataclasses.asdict(row) for row in rows)
 
 
 def draw(rows: list[Row], path: Path) -> None:
@@ -188,7 +191,7 @@ def main(arguments: list[str] | None = None) -> None:
             print(message, file=sys.stderr, flush=True)
     rows = [row for k in range(len(cases)) for name in SCHEMES for row in found[k, name]]
     show(rows)
-    write_csv(rows, options.out / "mechanisms.csv")
+    harness.write_csv(rows, options.out / "mechanisms.csv")
     draw(rows, options.out / "mechanisms.png")
     print(f"\n{len(rows)} runs in {time.perf_counter() - begin:.0f} s, with compilation.")
 

@@ -38,19 +38,8 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
         "compositions above order 4",
     )
     options = parser.parse_args(arguments)
-    try:
-        options.out.mkdir(parents=True, exist_ok=True)
-        (options.out / "orders.csv").touch()
-    except OSError as error:
-        parser.error(f"cannot write to --out {options.out}: {error.strerror}")
+    options.out.mkdir(parents=True, exist_ok=True)
     return options
-
-
-def _progress(message: str) -> None:
-    if sys.stderr.isatty():
-        print(f"\r\x1b[K{message}", end="", file=sys.stderr, flush=True)
-    else:
-        print(message, file=sys.stderr, flush=True)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -80,10 +69,9 @@ def main(arguments: list[str] | None = None) -> None:
             k = futures[future]
             rows[k] = future.result()
             case, method = rows[k][-1].case, rows[k][-1].method
-            _progress(f"{len(rows)} of {len(tasks)}: {case.name}, {method.name}")
+            done = f"{len(rows)} of {len(tasks)}"
+            print(f"{done}: {case.name}, {method.name}", file=sys.stderr)
     table = [row for k in sorted(rows) for row in rows[k]]
-    if sys.stderr.isatty():
-        print("\r\x1b[K", end="", file=sys.stderr)
     print(order_report.as_text(table))
     seconds = time.perf_counter() - begin
     order_report.write_csv(table, options.out / "orders.csv")

@@ -67,19 +67,7 @@ def _our_run(
 ) -> tuple[harness.Row, Callable | None]:
     system, start, args = work.problem()
     steps = round(work.end / h)
-
-    def run(start, args, h) -> ej.Solution:
-        return ej.simulate(
-            system,
-            scheme,
-            start,
-            args,
-            h=h,
-            num_steps=steps,
-            saveat=ej.SaveAt(every=steps),
-            throw=False,
-        )
-
+    run = harness.run_of(system, scheme, steps)
     program, _ = harness.compiled(run, start, args, h)
     solution = program(start, args, h)
     error = work.error(work.positions(np.asarray(solution.ys.q[-1])), exact)

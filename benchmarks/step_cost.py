@@ -79,21 +79,7 @@ def our_rows(quick: bool) -> list[harness.Row]:
         system, start, args = problem_of(work)
         for name, h, bound in table:
             steps = round(end / h)
-            scheme = scheme_of(name)
-
-            def run(
-                start, args, h, *, system=system, scheme=scheme, steps=steps
-            ) -> ej.Solution:
-                return ej.simulate(
-                    system,
-                    scheme,
-                    start,
-                    args,
-                    h=h,
-                    num_steps=steps,
-                    saveat=ej.SaveAt(every=steps),
-                )
-
+            run = harness.run_of(system, scheme_of(name), steps)
             program, seconds = harness.compiled(run, start, args, h)
             solution = program(start, args, h)
             position = np.asarray(solution.ys.q[-1])[: len(exact[work])]
@@ -104,7 +90,7 @@ def our_rows(quick: bool) -> list[harness.Row]:
             if error <= bound:
                 row |= dict(steps=steps, compile_s=seconds)
                 iterations = solution.stats.newton_iterations
-                row["iterations"] = float(np.mean(iterations))
+                row["iterations"] = float(np.sum(iterations)) / steps
                 programs.append(lambda p=program, x=(start, args, h): p(*x))
             else:
                 print(f"{name} on the {work} is off by {error:.1e}: not timed")

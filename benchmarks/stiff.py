@@ -77,17 +77,8 @@ def _run(
     system, start, args = ej.problems.stiff_double_pendulum()
     is_fixed = isinstance(controller, ej.EqualSteps)
     most = round(END / STEPS[-1]) + 1 if is_fixed else None
-    return ej.simulate(
-        system,
-        scheme,
-        start,
-        args,
-        h=h,
-        t1=END,
-        max_steps=most,
-        controller=controller,
-        throw=False,
-    )
+    run = functools.partial(ej.simulate, system, scheme, start, args, h=h, t1=END)
+    return run(max_steps=most, controller=controller, throw=False)
 
 
 def _outcome(run: Callable[[], ej.Solution], end: np.ndarray) -> harness.Row:

@@ -1,4 +1,6 @@
+import gc
 import os
+import pathlib
 
 import jax
 import jaxlib
@@ -26,8 +28,19 @@ def is_type_checked(request):
     return bool(request.config.getoption("--jaxtyping-packages", None))
 
 
+# Tracing allocates millions of small objects that live for long. Python looks through all of
+# them for cycles so often, with its own settings, that a twelfth of the time goes there.
+gc.set_threshold(50_000, 20, 100)
+
+# A process can map only so many pieces of memory, 65530 on most machines, and each compiled
+# program takes some.
+MAPS = pathlib.Path("/proc/self/maps")
+MANY_MAPS = 10_000
+
+
 @pytest.fixture(autouse=True, scope="module")
 def forget_programs():
-    """A process can map only so many compiled programs into its memory."""
+    """Modules share programs until there are too many to keep."""
     yield
-    jax.clear_caches()
+    if not MAPS.exists() or MAPS.read_bytes().count(b"\n") > MANY_MAPS:
+        jax.clear_caches()

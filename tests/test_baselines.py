@@ -11,10 +11,10 @@ from scipy.integrate import solve_ivp
 
 import enerjax as ej
 
-from .by_hand import alpha_by_hand, rattle_by_hand
+from .driven_pendulum import ARGS, driven_start, kinetic, moved_rod, potential
 from .helpers import problem, slopes
+from .numpy_schemes import generalized_alpha, rattle
 from .references import double_pendulum_reference
-from .shaken import ARGS, kinetic, moved_rod, potential, shaken_start
 
 
 SCHEMES = {
@@ -51,7 +51,7 @@ def march(system, scheme, start, args, *, h, steps, t0=0.0):
 def test_rattle_is_the_published_method():
     system, start, args = problem("double")
     out = march(system, SCHEMES["rattle"], start, args, h=0.01, steps=100)
-    q, v = rattle_by_hand(np.asarray(start.q), np.asarray(start.v), 0.01, 100)
+    q, v = rattle(np.asarray(start.q), np.asarray(start.v), 0.01, 100)
     # Round-off of a hundred steps.
     np.testing.assert_allclose(out.state.q, q, rtol=0, atol=1e-12)
     np.testing.assert_allclose(out.state.v, v, rtol=0, atol=1e-11)
@@ -62,7 +62,7 @@ def test_generalized_alpha_is_the_published_method():
     out = march(system, SCHEMES["alpha"], start, args, h=0.01, steps=100)
     q, v = (np.asarray(x) for x in (start.q, start.v))
     first = np.asarray(ej.consistent_start(system, q, v, args).accelerations)
-    q, v = alpha_by_hand(q, v, first, first, 0.01, 100, 0.9)
+    q, v = generalized_alpha(q, v, first, first, 0.01, 100, 0.9)
     # Round-off of a hundred steps; positions over h^2 in the accelerations.
     np.testing.assert_allclose(out.state.q, q, rtol=0, atol=1e-10)
     np.testing.assert_allclose(out.state.v, v, rtol=0, atol=1e-9)
@@ -127,7 +127,7 @@ def damped_reference():
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["rattle", "alpha", "alpha ggl"])
 def test_order_with_a_damper_and_a_drive(scheme):
-    args, start, method = ARGS | dict(c=0.4), shaken_start(), SCHEMES[scheme]
+    args, start, method = ARGS | dict(c=0.4), driven_start(), SCHEMES[scheme]
     runs = [
         march(DAMPED, method, start, args, h=(T1 - T0) / n, steps=n, t0=T0)
         for n in (100, 200, 400)

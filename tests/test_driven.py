@@ -11,15 +11,23 @@ from scipy.integrate import solve_ivp
 
 import enerjax as ej
 
+from .driven_pendulum import (
+    ARGS,
+    DRIVEN_PENDULUM,
+    driven_start,
+    kinetic,
+    pivot,
+    potential,
+    SCHEMES,
+)
 from .helpers import follow, slopes
-from .shaken import ARGS, kinetic, pivot, potential, SCHEMES, SHAKEN, shaken_start
 
 
 T0, T1 = 0.2, 2.2
 
 
 @functools.cache
-def shaken_reference():
+def driven_reference():
     """Of the angle from +y, seen from the pivot: its acceleration acts as a force."""
     r, w, g = (ARGS[name] for name in "rwg")
     rates = lambda t, y: [
@@ -32,14 +40,14 @@ def shaken_reference():
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_a_pendulum_on_a_shaken_pivot(scheme):
+def test_a_pendulum_on_a_moving_pivot(scheme):
     method, order = SCHEMES[scheme]
-    start = shaken_start()
+    start = driven_start()
     found, leaks = [], []
     for n in (50, 100):
         h = (T1 - T0) / n
-        state, leak, _ = follow(SHAKEN, method, start, ARGS, h=h, steps=n, t0=T0)
-        found.append(np.max(np.abs(state.q - shaken_reference())))
+        state, leak, _ = follow(DRIVEN_PENDULUM, method, start, ARGS, h=h, steps=n, t0=T0)
+        found.append(np.max(np.abs(state.q - driven_reference())))
         leaks.append(float(leak))
     np.testing.assert_allclose(slopes(found), order, atol=0.25)
     # Solver, against a turnover of 15; a composition adds up its stages.
@@ -47,14 +55,20 @@ def test_a_pendulum_on_a_shaken_pivot(scheme):
 
 
 @functools.cache
-def shaken_run():
+def driven_run():
     return ej.simulate(
-        SHAKEN, ej.EnergyDecaying(1.0), shaken_start(), ARGS, h=0.02, num_steps=100, t0=T0
+        DRIVEN_PENDULUM,
+        ej.EnergyDecaying(1.0),
+        driven_start(),
+        ARGS,
+        h=0.02,
+        num_steps=100,
+        t0=T0,
     )
 
 
 def test_both_levels_hold_at_the_times_of_the_rows():
-    run = shaken_run()
+    run = driven_run()
     np.testing.assert_allclose(run.ts, T0 + 0.02 * np.arange(101), rtol=1e-14)
     r, w, t = ARGS["r"], ARGS["w"], np.asarray(run.ts)
     at = r * np.stack([np.sin(w * t), 0 * t], axis=1)
@@ -68,7 +82,7 @@ def test_both_levels_hold_at_the_times_of_the_rows():
 
 
 def test_the_audit_adds_up_with_the_work_of_the_drive():
-    audit = shaken_run().audit
+    audit = driven_run().audit
     change = audit.work + audit.drive_work - audit.dissipated
     leak = np.diff(audit.energy) - change[1:]
     # Solver, against a turnover of 15.
@@ -78,11 +92,11 @@ def test_the_audit_adds_up_with_the_work_of_the_drive():
 
 
 def test_rows_further_apart_sum_the_work():
-    run = shaken_run()
+    run = driven_run()
     thin = ej.simulate(
-        SHAKEN,
+        DRIVEN_PENDULUM,
         ej.EnergyDecaying(1.0),
-        shaken_start(),
+        driven_start(),
         ARGS,
         h=0.02,
         num_steps=100,
@@ -208,7 +222,7 @@ def test_an_arm_with_a_motor_and_a_damper_in_its_joints(damping, order):
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["preserving", "decaying"])
 def test_a_large_system_is_driven_and_damped(scheme):
-    """A chain on a shaken pivot, in a medium: 40 links, solved by bands."""
+    """A chain on a moving pivot, in a medium: 40 links, solved by bands."""
     chain, _, args = ej.problems.chain(40)
     links: Any = chain
     args = args | dict(r=0.1, w=4.0)

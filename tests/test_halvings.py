@@ -91,7 +91,7 @@ def test_derivatives_run_through_the_parts():
 def test_a_damped_driven_step_keeps_its_balance_in_parts():
     """Time passes through the parts, and work adds up over them."""
 
-    def shaken(q, t, args):
+    def on_moving_pivot(q, t, args):
         return jnp.array([q[0] - args["a"] * jnp.sin(args["w"] * t)])
 
     system = ej.System(
@@ -99,7 +99,7 @@ def test_a_damped_driven_step_keeps_its_balance_in_parts():
         lambda q, args: args["g"] * (q[1] + q[3]),
         lambda q, args: jnp.array([q[1], (q[2:] - q[:2]) @ (q[2:] - q[:2]) - 1.0]),
         force=lambda q, v, t, args: -args["c"] * v,
-        driven=shaken,
+        driven=on_moving_pivot,
     )
     args = dict(a=0.3, w=5.0, g=9.81, c=0.1)
     start = ej.initial_state(system, [0.0, 0.0, 1.0, 0.0], [0.0] * 4, args)

@@ -11,13 +11,13 @@ import pytest
 
 import enerjax as ej
 
-from . import swept
+from . import sweep_process
 
 
 @functools.cache
 def here():
     """The sweep in this process, on one device."""
-    return swept.swept()
+    return sweep_process.run_sweep()
 
 
 class Outcome(eqx.Enumeration):
@@ -59,7 +59,7 @@ def test_chunks_and_batches_change_nothing(chunk, batch_size):
 
 def test_a_lane_is_its_run_alone():
     part = here().at(l=2.0, h=5e-3, g=9.81)
-    alone = swept.motion(2.0, 5e-3, 9.81)
+    alone = sweep_process.motion(2.0, 5e-3, 9.81)
     # Solver: lanes are compiled differently.
     np.testing.assert_allclose(part.values["q"], alone["q"], rtol=0, atol=1e-12)
     assert part.parameters == dict(l=2.0, h=5e-3, g=9.81)

@@ -133,7 +133,7 @@ def process(*arguments, devices=1, **options):
         # Another order of sets and dictionaries must not make another program.
         "PYTHONHASHSEED": str(devices),
     }
-    command = [sys.executable, "-m", "tests.swept", *map(str, arguments)]
+    command = [sys.executable, "-m", "tests.sweep_process", *map(str, arguments)]
     return subprocess.Popen(
         command, cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True, **options
     )

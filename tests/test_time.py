@@ -8,12 +8,20 @@ from jax.extend.core import Literal
 
 import enerjax as ej
 
-from .shaken import ARGS, kinetic, moved_rod, potential, SCHEMES, SHAKEN, shaken_start
+from .driven_pendulum import (
+    ARGS,
+    DRIVEN_PENDULUM,
+    driven_start,
+    kinetic,
+    moved_rod,
+    potential,
+    SCHEMES,
+)
 
 
 def reach(numbers, scheme):
     args = ARGS | dict(w=numbers[0], r=numbers[1])
-    begin = shaken_start(numbers[2], args)
+    begin = driven_start(numbers[2], args)
     system = ej.System(
         kinetic, potential, driven=moved_rod, force=lambda q, v, t, args: -0.3 * v * t
     )
@@ -68,11 +76,13 @@ def test_without_force_and_drive_there_is_no_time(scheme):
     assert out.energies.work is None
     assert out.energies.drive_work is None
     # With a drive there is: the test above can fail.
-    jaxpr, _ = program(SHAKEN)
+    jaxpr, _ = program(DRIVEN_PENDULUM)
     assert depends(jaxpr, jaxpr.invars[0])
 
 
 def test_time_is_no_leaf_of_what_users_hold():
-    out = ej.step(SHAKEN, SCHEMES["preserving"][0], shaken_start(), ARGS, h=0.01, t=0.2)
+    out = ej.step(
+        DRIVEN_PENDULUM, SCHEMES["preserving"][0], driven_start(), ARGS, h=0.01, t=0.2
+    )
     assert out.state.t is None
-    assert shaken_start().t is None
+    assert driven_start().t is None

@@ -2,6 +2,7 @@ from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, ScalarLike
+from typing_extensions import TypeAliasType
 
 
 # Dimensions used in every annotation of the package:
@@ -16,6 +17,7 @@ Velocities: TypeAlias = Float[Array, " nv"]
 Multipliers: TypeAlias = Float[Array, " nc"]
 JointMultipliers: TypeAlias = Float[Array, " nj"]
 Times: TypeAlias = Float[Array, " times"]
-# What users may write for a number and for a vector.
-Real: TypeAlias = ScalarLike
-Vector: TypeAlias = ArrayLike | Sequence[ScalarLike]
+# What users may write for a number and for a vector: types with a name, so that signatures
+# can be read.
+Real = TypeAliasType("Real", ScalarLike)
+Vector = TypeAliasType("Vector", ArrayLike | Sequence[ScalarLike])

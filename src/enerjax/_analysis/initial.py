@@ -228,12 +228,12 @@ def _project(
     rates = State(model.lift(q, state.v), acceleration, jax.tree.map(jnp.ones_like, t))
     user_state, user_rates = jax.jvp(model.to_user, (state,), (rates,))
     start = ConsistentStart(
-        user_state,
-        user_rates.v,
-        multipliers,
-        before,
-        model.constraint(q, t),
-        model.joint_rate(q, given.v, t),
-        model.joint_rate(q, state.v, t),
+        state=user_state,
+        accelerations=user_rates.v,
+        multipliers=multipliers,
+        constraint_before=before,
+        constraint_after=model.constraint(q, t),
+        rate_before=model.joint_rate(q, given.v, t),
+        rate_after=model.joint_rate(q, state.v, t),
     )
     return start, near, kept, jax.lax.stop_gradient(rank_of_constraints(model, state))

@@ -117,13 +117,13 @@ def freedoms(
     # What no motion can repair: the part of the residual outside of the range.
     stuck = left[:, rank:] @ (left[:, rank:].T @ residual)
     return Mobility(
-        num_coordinates - rank,
-        rank,
-        num_constraints,
-        label(set(range(num_constraints)) - set(kept)),
-        label(np.nonzero(np.abs(stuck) > _MET)[0]),
-        values,
-        scipy.linalg.solve_triangular(root.T, right[rank:].T),
+        degrees_of_freedom=num_coordinates - rank,
+        rank=rank,
+        num_constraints=num_constraints,
+        redundant=label(set(range(num_constraints)) - set(kept)),
+        inconsistent=label(np.nonzero(np.abs(stuck) > _MET)[0]),
+        singular_values=values,
+        velocities=scipy.linalg.solve_triangular(root.T, right[rank:].T),
     )
 
 

@@ -1,5 +1,5 @@
 from .base import AbstractDerivative as AbstractDerivative
-from .chain import (
+from .chain_rule import (
     ChainRule as ChainRule,
     discrete_fallbacks as discrete_fallbacks,
     discrete_grad as discrete_grad,

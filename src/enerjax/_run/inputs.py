@@ -36,7 +36,7 @@ def prepare(
     root_finder: RootFinder,
 ) -> tuple[State, Args, Scalar, Scalar]:
     """Checked start, `args` of arrays, and `h` and `t` in the dtype of the start."""
-    if not isinstance(root_finder, RootFinder):
+    if not isinstance(root_finder, RootFinder.__value__):
         raise TypeError(
             "`root_finder` must be a root finder such as `enerjax.Newton()`, or one of "
             "optimistix, or a solver of its for least squares, such as "

@@ -2,13 +2,14 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
+from typing_extensions import TypeAliasType
 
 from .._operators import AbstractModel
 from .._programs import is_known
@@ -20,7 +21,7 @@ from .inputs import positive_integer
 from .step_sizes import AbstractController, AbstractPlan, EqualSteps
 
 
-SaveFunction: TypeAlias = Callable[[Scalar, State, Args], PyTree[Any]]
+SaveFunction = TypeAliasType("SaveFunction", Callable[[Scalar, State, Args], PyTree[Any]])
 
 
 class SaveAt(eqx.Module):

@@ -123,17 +123,17 @@ def advance(
     multipliers, energies, details, costs, results = reported
     iterations, residuals, halvings, sizes = costs
     return StepOutput(
-        state,
+        state=state,
         # The mean force over the step: stages count by their length, backwards ones too.
-        lengths @ multipliers,
-        jax.tree.map(jnp.sum, energies),
-        jax.tree.map(lambda x: x[-1], details),
-        jnp.sum(iterations),
-        largest(residuals),
-        jnp.max(halvings),
-        local_error(sizes, scheme.order),
-        first_of(results),
-        Warm(memory, rest),
+        multipliers=lengths @ multipliers,
+        energies=jax.tree.map(jnp.sum, energies),
+        details=jax.tree.map(lambda x: x[-1], details),
+        newton_iterations=jnp.sum(iterations),
+        residual=largest(residuals),
+        halvings=jnp.max(halvings),
+        local_error=local_error(sizes, scheme.order),
+        result=first_of(results),
+        warm=Warm(memory, rest),
     )
 
 

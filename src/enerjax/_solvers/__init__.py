@@ -16,21 +16,21 @@ from .linear.dense import (
     product as product,
     solve as solve,
 )
-from .linear.given import KLU as KLU
-from .linear.jacobian import (
-    affine_root as affine_root,
-    kept_factors as kept_factors,
-    RowPattern as RowPattern,
-)
-from .linear.norms import largest as largest
-from .linear.parts import (
+from .linear.independent_blocks import (
     constant_entries as constant_entries,
     multiply_parts as multiply_parts,
     Parts as Parts,
     parts_of as parts_of,
     solve_parts as solve_parts,
 )
+from .linear.jacobian import (
+    affine_root as affine_root,
+    kept_factors as kept_factors,
+    RowPattern as RowPattern,
+)
+from .linear.norms import largest as largest
 from .linear.symmetric import cholesky as cholesky, eigh as eigh
+from .linear.user_solver import KLU as KLU
 from .newton import Newton as Newton
 from .newton_iterations import max_norm as max_norm
 from .root import find_root as find_root, ROOT as ROOT

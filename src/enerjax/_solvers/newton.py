@@ -8,7 +8,7 @@ from jaxtyping import Array, PyTree
 from .._programs import is_known
 from .._types import Flag, Scalar
 from .linear.dense import AbstractFactors
-from .linear.given import KLU
+from .linear.user_solver import KLU
 
 
 class Newton(eqx.Module):

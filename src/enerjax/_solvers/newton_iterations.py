@@ -229,7 +229,14 @@ def _propose(
     size = largest(step / (jnp.abs(x) + floor))
     contraction = size / iterate.size
     shrinks = contraction < _SHRINKS
-    return _Correction(step, x, size, contraction, shrinks, max_norm(value))
+    return _Correction(
+        step=step,
+        x=x,
+        size=size,
+        contraction=contraction,
+        shrinks=shrinks,
+        defect=max_norm(value),
+    )
 
 
 def _classify(

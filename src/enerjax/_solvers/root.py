@@ -123,12 +123,12 @@ def find_root(
     """
     flat, _ = ravel_pytree(guess)
     start = Start(
-        guess,
-        tuple(others),
-        kept_factors(flat.size, flat.dtype) if factors is None else factors,
-        jnp.asarray(skip),
-        regularisation,
-        jnp.asarray(least, flat.dtype),
+        guess=guess,
+        others=tuple(others),
+        factors=kept_factors(flat.size, flat.dtype) if factors is None else factors,
+        skip=jnp.asarray(skip),
+        regularisation=regularisation,
+        least=jnp.asarray(least, flat.dtype),
     )
     start = jax.lax.stop_gradient(start)
     traced, opened = _opened(fn, guess, args)

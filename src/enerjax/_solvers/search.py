@@ -1,7 +1,7 @@
 """The search for a root: by Newton's method, or by a root finder of optimistix."""
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
+from typing_extensions import TypeAliasType
 
 from .._types import Count, Flag, Scalar
 from .linear.dense import AbstractFactors, Inverse
@@ -17,7 +18,9 @@ from .newton import Newton, Start
 from .newton_iterations import max_norm, newton_iterations, PATIENCE
 
 
-RootFinder: TypeAlias = Newton | optx.AbstractRootFinder | optx.AbstractLeastSquaresSolver
+RootFinder = TypeAliasType(
+    "RootFinder", Newton | optx.AbstractRootFinder | optx.AbstractLeastSquaresSolver
+)
 
 
 class Root(eqx.Module):
@@ -72,13 +75,13 @@ def search(
         # Tolerances finer than the unknowns can be resolved end at `max_iterations`.
         found = found | (residual <= Newton().atol * jnp.finfo(residual.dtype).eps)
         return Root(
-            solution.value,
-            start.factors,
-            steps,
-            residual,
-            found,
-            singular | nonfinite,
-            jnp.isfinite(residual),
+            value=solution.value,
+            factors=start.factors,
+            iterations=steps,
+            residual=residual,
+            found=found,
+            broken=singular | nonfinite,
+            finite=jnp.isfinite(residual),
         )
     flat, _, flat_fn = flattened(fn, start.guess)
     given, regularisation = root_finder.linear_solver, flat_of(start.regularisation)
@@ -112,13 +115,13 @@ def _iterated(
     keeps = residual.keeps_factors and start.factors is not None
     factors = last.factors if keeps else start.factors
     return Root(
-        unravel(x),
-        factors,
-        last.corrections,
-        last.defect,
-        last.done,
-        last.broken,
-        jnp.isfinite(last.defect),
+        value=unravel(x),
+        factors=factors,
+        iterations=last.corrections,
+        residual=last.defect,
+        found=last.done,
+        broken=last.broken,
+        finite=jnp.isfinite(last.defect),
     )
 
 

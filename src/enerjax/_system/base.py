@@ -22,11 +22,12 @@ coordinates last.
 
 import abc
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+from typing_extensions import TypeAliasType
 
 from .._solvers import Symmetric
 from .._types import Args, Coordinates, JointMultipliers, Multipliers, Scalar, Velocities
@@ -43,11 +44,18 @@ def inexact(x: Any) -> Array:
     return x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(float)
 
 
-# `force(q, v, t, args)` and `driven(q, t, args)`.
-Force: TypeAlias = Callable[[Coordinates, Velocities, Scalar, Args], Velocities]
-Driven: TypeAlias = Callable[[Coordinates, Scalar, Args], JointMultipliers]
-# `symmetry(q, args)`.
-Symmetry: TypeAlias = Callable[[Coordinates, Args], Float[Array, "ns nv"]]
+# The functions of a system: types with a name, so that signatures can be read.
+Potential = TypeAliasType("Potential", Callable[[Coordinates, Args], Scalar])
+Constraint = TypeAliasType("Constraint", Callable[[Coordinates, Args], Multipliers])
+Kinematics = TypeAliasType(
+    "Kinematics", Callable[[Coordinates, Args], Float[Array, "nv nq"]]
+)
+KineticEnergy = TypeAliasType("KineticEnergy", Callable[[Velocities, Args], Scalar])
+Force = TypeAliasType(
+    "Force", Callable[[Coordinates, Velocities, Scalar, Args], Velocities]
+)
+Driven = TypeAliasType("Driven", Callable[[Coordinates, Scalar, Args], JointMultipliers])
+Symmetry = TypeAliasType("Symmetry", Callable[[Coordinates, Args], Float[Array, "ns nv"]])
 
 
 class State(eqx.Module):
@@ -69,7 +77,7 @@ class State(eqx.Module):
 class AbstractSystem(eqx.Module):
     """A mechanical system with holonomic constraints, forces and drives."""
 
-    constraint: eqx.AbstractVar[Callable[[Coordinates, Args], Multipliers] | None]
+    constraint: eqx.AbstractVar[Constraint | None]
     force: eqx.AbstractVar[Force | None]
     driven: eqx.AbstractVar[Driven | None]
     symmetry: eqx.AbstractVar[Symmetry | None]

@@ -8,8 +8,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._types import Args, Coordinates, Multipliers, Scalar, Velocities
-from .base import AbstractSystem, check_function, Driven, Force, State, Symmetry
+from .._types import Args, Coordinates, Scalar, Velocities
+from .base import (
+    AbstractSystem,
+    check_function,
+    Constraint,
+    Driven,
+    Force,
+    Potential,
+    State,
+    Symmetry,
+)
 
 
 class AbstractCanonicalSystem(AbstractSystem):
@@ -38,8 +47,8 @@ class LagrangianSystem(AbstractCanonicalSystem):
     """A system whose inertia depends on its coordinates: `System.from_lagrangian`."""
 
     kinetic: Callable[[Coordinates, Velocities, Args], Scalar]
-    potential: Callable[[Coordinates, Args], Scalar]
-    constraint: Callable[[Coordinates, Args], Multipliers] | None = None
+    potential: Potential
+    constraint: Constraint | None = None
     force: Force | None = None
     driven: Driven | None = None
     symmetry: Symmetry | None = None
@@ -84,7 +93,7 @@ class HamiltonianSystem(AbstractCanonicalSystem):
     """A system given by its Hamiltonian: `System.from_hamiltonian`."""
 
     hamiltonian: Callable[[Coordinates, Coordinates, Args], Scalar]
-    constraint: Callable[[Coordinates, Args], Multipliers] | None = None
+    constraint: Constraint | None = None
     force: Force | None = None
     driven: Driven | None = None
     symmetry: Symmetry | None = None

@@ -3,11 +3,22 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
 
 from .._solvers import BlockDiagonal, hessian, in_blocks, Symmetric
-from .._types import Args, Coordinates, Multipliers, Scalar, Velocities
-from .base import AbstractSystem, check_function, Driven, Force, inexact, State, Symmetry
+from .._types import Args, Coordinates, Scalar, Vector, Velocities
+from .base import (
+    AbstractSystem,
+    check_function,
+    Constraint,
+    Driven,
+    Force,
+    inexact,
+    Kinematics,
+    KineticEnergy,
+    Potential,
+    State,
+    Symmetry,
+)
 from .canonical import HamiltonianSystem, LagrangianSystem
 from .kinematics import AbstractKinematics, ConfigurationKinematics, IdentityKinematics
 
@@ -51,11 +62,11 @@ class System(AbstractSystem):
     run begins, where args and sizes are known.
     """
 
-    kinetic: Callable[[Velocities, Args], Scalar] | Symmetric
-    potential: Callable[[Coordinates, Args], Scalar]
-    constraint: Callable[[Coordinates, Args], Multipliers] | None
+    kinetic: KineticEnergy | Symmetric
+    potential: Potential
+    constraint: Constraint | None
     kinematics: AbstractKinematics
-    coordinate_constraint: Callable[[Coordinates, Args], Multipliers] | None
+    coordinate_constraint: Constraint | None
     force: Force | None
     driven: Driven | None
     symmetry: Symmetry | None
@@ -63,12 +74,12 @@ class System(AbstractSystem):
 
     def __init__(
         self,
-        kinetic: Callable[[Velocities, Args], Scalar] | ArrayLike | BlockDiagonal,
-        potential: Callable[[Coordinates, Args], Scalar],
-        constraint: Callable[[Coordinates, Args], Multipliers] | None = None,
+        kinetic: KineticEnergy | Vector | BlockDiagonal,
+        potential: Potential,
+        constraint: Constraint | None = None,
         *,
-        kinematics: Callable[[Coordinates, Args], Float[Array, "nv nq"]] | None = None,
-        coordinate_constraint: Callable[[Coordinates, Args], Multipliers] | None = None,
+        kinematics: Kinematics | None = None,
+        coordinate_constraint: Constraint | None = None,
         force: Force | None = None,
         driven: Driven | None = None,
         symmetry: Symmetry | None = None,
@@ -136,8 +147,8 @@ class System(AbstractSystem):
     @staticmethod
     def from_lagrangian(
         kinetic: Callable[[Coordinates, Velocities, Args], Scalar],
-        potential: Callable[[Coordinates, Args], Scalar],
-        constraint: Callable[[Coordinates, Args], Multipliers] | None = None,
+        potential: Potential,
+        constraint: Constraint | None = None,
         *,
         force: Force | None = None,
         driven: Driven | None = None,
@@ -178,7 +189,7 @@ class System(AbstractSystem):
     @staticmethod
     def from_hamiltonian(
         hamiltonian: Callable[[Coordinates, Coordinates, Args], Scalar],
-        constraint: Callable[[Coordinates, Args], Multipliers] | None = None,
+        constraint: Constraint | None = None,
         *,
         force: Force | None = None,
         driven: Driven | None = None,

@@ -2,7 +2,7 @@
 
 from . import bodies as bodies, drives as drives, forces as forces, joints as joints
 from ._gaps import Gap as Gap
-from ._motions import Reaction as Reaction
 from ._parameters import Parameters as Parameters
 from ._readouts import Readout as Readout
+from ._relative_motions import Reaction as Reaction
 from .scene import Scene as Scene

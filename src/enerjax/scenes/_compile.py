@@ -11,13 +11,13 @@ from jaxtyping import Array
 
 from .._programs import is_known
 from .._types import Coordinates
+from ._arguments import module_of, number
+from ._ends import Ends
 from ._frames import Frame, GROUND, Numbers
 from ._hinges import Hinge, Hinges
 from ._laws import Alignment
 from ._layout import Layout, Link, numbers_of
-from ._numbers import module_of, number
 from ._parameters import Parameters
-from ._start import Ends
 from ._view import View
 from .bodies import AbstractBody
 from .drives import AbstractDrive
@@ -151,7 +151,15 @@ class _StartPose:
 
     def __init__(self, bodies: Sequence[AbstractBody], rows: dict[str, int]):
         kinds = tuple((body.name, body.kind) for body in bodies)
-        self._layout = Layout(bodies[0].kind.dimension, kinds, (), (), (), (), False)
+        self._layout = Layout(
+            dimension=bodies[0].kind.dimension,
+            bodies=kinds,
+            joints=(),
+            forces=(),
+            constraints=(),
+            potentials=(),
+            has_gravity=False,
+        )
         self._rows, self.hinges = rows, Hinges()
         q = join([body.q for body in bodies])
         frames = _all_frames(self._layout, jnp.asarray(q))
@@ -175,7 +183,11 @@ class _StartPose:
         a, b = (jax.tree.map(lambda x, k=k: x[k], self._frames) for k in numbers)
         turns = [k == 0 or bool(self._layout.turning[k]) for k in numbers]
         return Ends(
-            f"'{part.name}'", (part.a, part.b), (a, b), (turns[0], turns[1]), self.hinges
+            part=f"'{part.name}'",
+            bodies=(part.a, part.b),
+            frames=(a, b),
+            turns=(turns[0], turns[1]),
+            hinges=self.hinges,
         )
 
 

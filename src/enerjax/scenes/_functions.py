@@ -12,11 +12,11 @@ from jaxtyping import Array, Float
 
 from .._system import System
 from .._types import Coordinates, Multipliers, Scalar, Velocities
+from ._feedback import Moving
 from ._laws import AbstractPush, Acting, Driven
 from ._layout import Layout, Links
-from ._moving import Moving
-from ._own import ask, vector_of
 from ._parameters import Parameters
+from ._user_functions import ask, vector_of
 from ._view import evaluate, lift, rows, View
 
 

@@ -8,15 +8,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import Coordinates, Scalar
+from ._constraint_rows import members
 from ._frames import Frame, Numbers
 from ._functions import drives_at
 from ._laws import Driven, Length, Missed
 from ._layout import Layout, Links
 from ._measures import Separation, Slide
-from ._motions import moved, pivot_of, still
-from ._own import vector_of
 from ._parameters import Parameters
-from ._rows import members
+from ._relative_motions import moved, pivot_of, still
+from ._user_functions import vector_of
 from ._view import evaluate, View
 
 

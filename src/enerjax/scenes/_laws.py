@@ -9,10 +9,11 @@ momenta of these to round-off.
 import abc
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array
+from typing_extensions import TypeAliasType
 
 from .._types import Args, Multipliers, Scalar
 from ._frames import Frame, Numbers, Point
@@ -116,7 +117,7 @@ class Steady(AbstractStored):
 # Laws that time or velocities enter -----------------------------------------------------
 
 # A function of time and of the `args` of the system.
-Signal: TypeAlias = Callable[[Scalar, Args], Array]
+Signal = TypeAliasType("Signal", Callable[[Scalar, Args], Array])
 
 
 @dataclass(frozen=True)

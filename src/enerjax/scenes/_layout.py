@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ._body_coordinates import AbstractBodyCoordinates
 from ._frames import GROUND
-from ._kinds import AbstractKind
 from ._laws import AbstractPush
 from ._measures import AbstractLaw
 
@@ -25,7 +25,7 @@ class Link(NamedTuple):
 class Bodies(NamedTuple):
     """All bodies of a kind: names, and their coordinates and velocities, row by row."""
 
-    kind: AbstractKind
+    kind: AbstractBodyCoordinates
     names: tuple[str, ...]
     q: np.ndarray
     v: np.ndarray
@@ -49,7 +49,7 @@ class Layout:
     """
 
     dimension: int
-    bodies: tuple[tuple[str, AbstractKind], ...]
+    bodies: tuple[tuple[str, AbstractBodyCoordinates], ...]
     joints: tuple[Link, ...]
     forces: tuple[Link, ...]
     constraints: tuple[tuple[str, Callable], ...]
@@ -130,7 +130,7 @@ class Layout:
         return sum(kind.num_velocities for _, kind in self.bodies)
 
 
-def numbers_of(bodies: Iterable[tuple[str, AbstractKind]]) -> dict[str, int]:
+def numbers_of(bodies: Iterable[tuple[str, AbstractBodyCoordinates]]) -> dict[str, int]:
     """The ground is 0; bodies follow kind by kind."""
     groups = _grouped(bodies, lambda body: body[1])
     names = [name for _, members in groups for name, _ in members]

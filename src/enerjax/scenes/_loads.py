@@ -1,22 +1,25 @@
 """Forces without a potential; they are public in `forces`."""
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 from jaxtyping import Array
+from typing_extensions import TypeAliasType
 
 from .._types import Args, Real, Scalar, Vector
-from ._forces import AbstractForce
+from ._arguments import number
+from ._ends import Ends
 from ._frames import GROUND, Numbers
 from ._laws import Acting, Following, Viscous
 from ._measures import AbstractLaw, Place, Separation, turn_of
-from ._numbers import number
-from ._own import takes_view
-from ._start import Ends
+from ._part import AbstractForce
+from ._user_functions import takes_view
 
 
 # What a program gives: a function of time, or of the bodies in motion too.
-Program: TypeAlias = Callable[[Scalar, Args], Array] | Callable[[Any, Scalar, Args], Array]
+Program = TypeAliasType(
+    "Program", Callable[[Scalar, Args], Array] | Callable[[Any, Scalar, Args], Array]
+)
 
 
 class Damper(AbstractForce):
@@ -28,9 +31,6 @@ class Damper(AbstractForce):
     this is certain only where the line keeps its direction.
     """
 
-    name: str
-    a: str
-    b: str
     damping: Real
     point_a: Vector | None = None
     point_b: Vector | None = None
@@ -47,9 +47,6 @@ class TorsionDamper(AbstractForce):
     keep common to both bodies. Full turns do not matter.
     """
 
-    name: str
-    a: str
-    b: str
     damping: Real
     axis: Vector | None = None
 
@@ -83,9 +80,6 @@ class Actuator(AbstractForce):
     is exact in the balance of every step, and of order 2.
     """
 
-    name: str
-    a: str
-    b: str
     force: Program
     point_a: Vector | None = None
     point_b: Vector | None = None
@@ -108,9 +102,6 @@ class TorsionActuator(AbstractForce):
     of the actuator itself are the angle between its bodies and the rate.
     """
 
-    name: str
-    a: str
-    b: str
     torque: Program
     axis: Vector | None = None
 
@@ -130,9 +121,6 @@ class Load(AbstractForce):
     `force(view, t, args)`, as of an `Actuator`.
     """
 
-    name: str
-    a: str
-    b: str
     force: Program
     point: Vector | None
 
@@ -152,9 +140,6 @@ class Load(AbstractForce):
 class Follower(AbstractForce):
     """A force that turns with its `body`: as `Load`, but told in the axes of the body."""
 
-    name: str
-    a: str
-    b: str
     force: Program
     point: Vector | None
 

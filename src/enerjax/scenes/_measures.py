@@ -11,8 +11,8 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 
 from .._types import Multipliers, Scalar, Vector
+from ._ends import Ends
 from ._frames import Frame, Numbers, Point
-from ._start import Ends
 
 
 class AbstractLaw(abc.ABC):

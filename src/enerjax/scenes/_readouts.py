@@ -10,13 +10,13 @@ from jaxtyping import Array, Float
 from .._analysis import ConsistentStart, Equilibrium
 from .._system import State
 from .._types import Real, Scalar
+from ._feedback import link_of, measure_of, Moving
 from ._functions import at_time, pushes
 from ._laws import AbstractPush, AbstractStored, Driven, Length
 from ._layout import Layout
 from ._measures import Turn
-from ._motions import each
-from ._moving import link_of, measure_of, Moving
 from ._parameters import Parameters
+from ._relative_motions import each
 
 
 class Readout(NamedTuple):

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from .._programs import is_known
+from ._arguments import module_of, number, positive
 from ._frames import Numbers
-from ._numbers import module_of, number, positive
 
 
 def mass_and_inertia(name: str, mass: Any, inertia: Any, *, may_be_flat: bool) -> Numbers:

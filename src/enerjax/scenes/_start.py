@@ -1,144 +1,129 @@
-"""The two bodies of a joint or force in the start pose: what was not given follows."""
+"""What a start must have: joints almost closed, smooth motions, velocities that fit."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from .._analysis import start_near
 from .._programs import is_known
-from ._frames import Frame, Numbers
-from ._hinges import Hinges
-from ._numbers import basis, direction, module_of, number
+from .._system import State, System
+from .._types import Real
+from ._constraint_rows import first_dependent
+from ._functions import drives_at
+from ._gaps import by_name, Measured, measured
+from ._laws import Driven, Missed
+from ._layout import Layout
+from ._measures import Turn
+from ._parameters import Parameters
+from ._view import evaluate, lift, View
 
 
-class Ends(NamedTuple):
-    """The bodies that a part connects, in the start pose.
+# What is further off than this part of its bodies, or of their speed, is a mistake.
+_FAR = 0.05
 
-    - `part`, `bodies`: names, for messages.
-    - `frames`: with all fields that the plane or space has.
-    - `turns`: whether each has an orientation; the ground counts as one that has.
-    - `hinges`: the joints of the scene that keep an axis; none are known to joints.
-    """
 
-    part: str
-    bodies: tuple[str, str]
-    frames: tuple[Frame, Frame]
-    turns: tuple[bool, bool]
-    hinges: Hinges = Hinges()
+def gaps_of(layout: Layout, state: State, t: Real, args: Parameters) -> dict[str, Measured]:
+    """How far each joint, constraint and drive is from closed."""
+    q, rates = state.q, lift(layout, state.q, state.v)
+    return by_name(layout, measured(layout, q, rates, jnp.asarray(t, q.dtype), args))
 
-    @property
-    def dimension(self) -> int:
-        return self.frames[0].origin.size
 
-    def points(self, point_a: Any, point_b: Any) -> Numbers:
-        """Points in the body frames; where one is missing, where the other one is."""
-        a, b = self._point(0, point_a), self._point(1, point_b)
-        if a is None and b is not None:
-            a = self._seen(0, 1, b)
-        elif b is None and a is not None:
-            b = self._seen(1, 0, a)
-        return self.origins(a, b)
+def check_poses(
+    found: dict[str, Measured], ends: dict[str, tuple[str, str]], t: Real
+) -> None:
+    """Raises for joints that are not almost closed."""
+    for name, gap in found.items():
+        if not np.isfinite([gap.position, gap.velocity]).all():
+            raise ValueError(
+                f"What '{name}' prescribes has no finite value and rate at the start, "
+                f"t = {t}: its function must be smooth there."
+            )
+        if name in ends and gap.position > _FAR * gap.size:
+            a, b = ends[name]
+            raise ValueError(
+                f"'{name}' is off by {gap.position:.3g} at the start, of bodies of size "
+                f"{gap.size:.3g}: the poses of '{a}' and '{b}' do not fit its points, "
+                "axes, length or motion. Points and axes are told in the frames of the "
+                "bodies, whose origin is the mass centre."
+            )
 
-    def origins(self, point_a: Any, point_b: Any) -> Numbers:
-        """Points in the body frames; where one is missing, the origin."""
-        a, b = self._point(0, point_a), self._point(1, point_b)
-        origin = 0 * self.frames[0].origin
-        return dict(point_a=origin if a is None else a, point_b=origin if b is None else b)
 
-    def axes(self, axis_a: Any, axis_b: Any = None) -> Numbers:
-        """The axes of the joint in both bodies, as rows; see `basis`."""
-        self.only_bodies_that_turn()
-        a, b = self.frames
-        of_a = basis(self._axis("`axis`", axis_a))
-        if axis_b is None:
-            return dict(frame_a=of_a, frame_b=of_a @ a.axes @ b.axes.T)
-        return dict(frame_a=of_a, frame_b=basis(self._axis("`axis_b`", axis_b)))
+class Told(NamedTuple):
+    """A start as the parts tell it: velocities that are not `given` are zero."""
 
-    def two_axes(self, axis_a: Any, axis_b: Any) -> Numbers:
-        """As `axes`, where both must be given."""
-        self._axis("`axis_b`", axis_b)
-        return self.axes(axis_a, axis_b)
+    state: State
+    given: tuple[int, ...]
 
-    def about(self, axis: Any) -> Numbers:
-        """As `axes`, of one that joints keep common to both bodies."""
-        numbers = self.axes(axis)
-        along = numbers["frame_a"][2] @ self.frames[0].axes
-        (a, b), others = self.bodies, self.hinges.between(*self.bodies)
-        if self.hinges.share(a, b, along):
-            return numbers
-        told = lambda axis: np.round(axis, 4).tolist()
+
+def closed_start(
+    layout: Layout,
+    system: System,
+    told: Told,
+    t: Real,
+    args: Parameters,
+    rows: dict[str, slice],
+) -> State:
+    """The state nearest to what is told with all joints closed; see `Scene.start`."""
+    known = is_known((told.state, t, args))
+    if layout.drives and known:
+        check_poses(gaps_of(layout, told.state, t, args), {}, t)
+    # Where all velocities are told the nearest are those with the least change.
+    partly = told.given if len(told.given) < told.state.v.size else ()
+    try:
+        start = start_near(system, told.state, args, t, partly)
+    except ValueError as error:
+        name = first_dependent(layout, told.state.q, t, args, rows) if known else None
+        if name is None:
+            raise
+        message = str(error).replace("`System(", "`Scene(")
         raise ValueError(
-            f"{self.part} has an angle only with a joint about its axis, a `Revolute` or "
-            f"`Cylindrical`, and none connects '{a}' and '{b}'"
-            + "".join(f": '{x.name}' turns about {told(x.axis)}" for x in others)
-            + (f", {self.part} about {told(along)}, in space." if others else ".")
+            f"{message} In this scene '{name}' repeats what other joints hold already."
+        ) from None
+    if known and is_known(start):
+        _check_velocities(layout, told, start, t, args)
+    return _check_turns(layout, start, t, args)
+
+
+def _check_velocities(
+    layout: Layout, told: Told, start: State, t: Real, args: Parameters
+) -> None:
+    """Raises where velocities that were given are not near to any that joints admit."""
+    numbers = np.array(told.given, int)
+    v = start.v.at[numbers].set(told.state.v[numbers])
+    if np.max(np.abs(v - start.v)) <= 1e-6 * np.max(np.abs(v)):
+        return
+    for name, gap in gaps_of(layout, State(start.q, v), t, args).items():
+        if gap.velocity > _FAR * gap.speed:
+            raise ValueError(
+                f"The velocities that are given do not fit '{name}': it would part at "
+                f"{gap.velocity:.3g}, with bodies that move at {gap.speed:.3g}. Leave out "
+                "those that follow from the joints. (`initial_state(scene.system, "
+                "scene.q, scene.v, scene.args)` finds the nearest that fit.)"
+            )
+
+
+def _check_turns(layout: Layout, start: State, t: Real, args: Parameters) -> State:
+    """The start, if no driven angle in space is half a turn away from its value.
+
+    The sines that are held vanish there too.
+    """
+    t = jnp.asarray(t, start.q.dtype)
+    for group, numbers in drives_at(layout, t, args):
+        if not isinstance(group.law, Driven) or not isinstance(group.law.measure, Turn):
+            continue
+        missed = group._replace(law=Missed(group.law.measure))
+        error = jnp.abs(evaluate(missed, View(layout, start.q), numbers))[:, 0]
+        opposite = jax.lax.stop_gradient(error > np.pi / 2)
+        message = (
+            "the pose of the start is nearer to the opposite of what is prescribed: give "
+            "the bodies the angle of their drive."
         )
-
-    def first_axes(self, axis_a: Any) -> Numbers:
-        """Axes in the first body alone, as rows."""
-        self._must_turn(0)
-        return dict(frame_a=basis(self._axis("`axis`", axis_a)))
-
-    def _axis(self, role: str, axis: Any) -> Any:
-        if axis is None:
-            raise ValueError(f"{self.part} needs {role}, a vector of {self.dimension}.")
-        return direction(self.part, role, axis, self.dimension)
-
-    def apart(self, point_a: Any, point_b: Any) -> tuple[Numbers, Any]:
-        """As `origins`, of points that do not meet, and their distance at the start."""
-        numbers = self.origins(point_a, point_b)
-        ends = zip(self.frames, ("point_a", "point_b"), strict=True)
-        a, b = (frame.origin + numbers[key] @ frame.axes for frame, key in ends)
-        xp = module_of(a, b)
-        length = xp.sqrt(xp.sum((b - a) ** 2))
-        if is_known(length) and length <= 1e-12 * (abs(a).max() + abs(b).max()):
-            raise ValueError(
-                f"{self.part} acts along the line of two points, and at the start those of "
-                f"'{self.bodies[0]}' and '{self.bodies[1]}' meet, in {a.tolist()}."
-            )
-        return numbers, length
-
-    def turn(self) -> Any:
-        """The difference of the angles at the start."""
-        return self.frames[1].angle - self.frames[0].angle
-
-    def refuse_axes(self, *axes: Any) -> None:
-        if any(axis is not None for axis in axes):
-            raise ValueError(f"{self.part} is in the plane, where it has no axis to give.")
-
-    def only_bodies_that_turn(self) -> None:
-        self._must_turn(0)
-        self._must_turn(1)
-
-    def _must_turn(self, k: int) -> None:
-        if not self.turns[k]:
-            raise ValueError(
-                f"{self.part} needs the orientation of '{self.bodies[k]}', and a point "
-                "mass has none."
-            )
-
-    def only_in_space(self, what: str) -> None:
-        if self.dimension == 2:
-            raise ValueError(f"{what} ({self.part}) is for bodies in space.")
-
-    def only_in_plane(self, what: str) -> None:
-        if self.dimension == 3:
-            raise ValueError(f"{what} ({self.part}).")
-
-    def _point(self, k: int, point: Any) -> Any:
-        if point is None:
-            return None
-        role = ("`point_a`", "`point_b`")[k]
-        point = number(self.part, role, point, (self.dimension,))
-        if not self.turns[k] and not (is_known(point) and not point.any()):
-            raise ValueError(
-                f"{role} of {self.part} is off '{self.bodies[k]}', which is a point mass: "
-                "leave it out."
-            )
-        return point
-
-    def _seen(self, k: int, other: int, point: Any) -> Any:
-        """In one body, where a point of the other one is at the start."""
-        if not self.turns[k]:
-            return None
-        there, here = self.frames[other], self.frames[k]
-        return here.axes @ (there.origin + point @ there.axes - here.origin)
+        if not is_known(opposite):
+            start = eqx.error_if(start, opposite, f"{[*group.names]}: {message}")
+        elif opposite.any():
+            k = int(np.argmax(error))
+            raise ValueError(f"'{group.names[k]}' is off by {error[k]:.3g}: {message}")
+    return start

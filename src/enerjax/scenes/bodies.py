@@ -11,10 +11,16 @@ from typing import Any
 import equinox as eqx
 
 from .._types import Real, Vector
+from ._arguments import joined, module_of, number, positive, velocities
+from ._body_coordinates import (
+    AbstractBodyCoordinates,
+    DirectorBodies,
+    PlanarBodies,
+    Points,
+    QuaternionBodies,
+)
 from ._frames import Numbers
-from ._kinds import AbstractKind, DirectorBodies, PlanarBodies, Points, QuaternionBodies
 from ._names import only_parts
-from ._numbers import joined, module_of, number, positive, velocities
 from ._rotations import mass_and_inertia, quaternion_of, rotation_matrix
 
 
@@ -26,15 +32,15 @@ class AbstractBody(eqx.Module):
     - `given`: which velocities are told; the others are zeros.
     """
 
-    name: eqx.AbstractVar[str]
-    numbers: eqx.AbstractVar[Numbers]
-    q: eqx.AbstractVar[Any]
-    v: eqx.AbstractVar[Any]
-    given: eqx.AbstractVar[tuple[bool, ...]]
+    name: str
+    numbers: Numbers
+    q: Any
+    v: Any
+    given: tuple[bool, ...]
 
     @property
     @abc.abstractmethod
-    def kind(self) -> AbstractKind:
+    def kind(self) -> AbstractBodyCoordinates:
         """The functions of its coordinates."""
 
 
@@ -51,12 +57,6 @@ class PointMass(AbstractBody):
     Its coordinates are the position. It has no orientation: joints that hold one refuse it.
     """
 
-    name: str
-    numbers: Numbers
-    q: Any
-    v: Any
-    given: tuple[bool, ...]
-
     def __init__(
         self, name: str, mass: Real, position: Vector, velocity: Vector | None = None
     ):
@@ -66,7 +66,7 @@ class PointMass(AbstractBody):
         self.v, self.given = velocities(f"'{name}'", (velocity, self.q.shape))
 
     @property
-    def kind(self) -> AbstractKind:
+    def kind(self) -> AbstractBodyCoordinates:
         return Points(self.q.size)
 
 
@@ -83,12 +83,6 @@ class PlanarBody(AbstractBody):
 
     Its coordinates are the mass centre and the angle, which counts full turns.
     """
-
-    name: str
-    numbers: Numbers
-    q: Any
-    v: Any
-    given: tuple[bool, ...]
 
     def __init__(
         self,
@@ -114,7 +108,7 @@ class PlanarBody(AbstractBody):
         )
 
     @property
-    def kind(self) -> AbstractKind:
+    def kind(self) -> AbstractBodyCoordinates:
         return PlanarBodies()
 
     @staticmethod
@@ -170,12 +164,6 @@ class RigidBody(AbstractBody):
     Give such a body its thickness, or take `QuaternionBody`.
     """
 
-    name: str
-    numbers: Numbers
-    q: Any
-    v: Any
-    given: tuple[bool, ...]
-
     def __init__(
         self,
         name: str,
@@ -197,7 +185,7 @@ class RigidBody(AbstractBody):
         self.given = (*given[:3], *given[3:] * 3)
 
     @property
-    def kind(self) -> AbstractKind:
+    def kind(self) -> AbstractBodyCoordinates:
         return DirectorBodies()
 
 
@@ -209,12 +197,6 @@ class QuaternionBody(AbstractBody):
     body axes. For flat bodies, which `RigidBody` refuses. Angular momentum is kept to
     second order, steps are solved densely, and `EnergyConsistent` needs `RigidBody`.
     """
-
-    name: str
-    numbers: Numbers
-    q: Any
-    v: Any
-    given: tuple[bool, ...]
 
     def __init__(
         self,
@@ -236,7 +218,7 @@ class QuaternionBody(AbstractBody):
         self.v = joined(v[:3], v[3:] @ matrix)
 
     @property
-    def kind(self) -> AbstractKind:
+    def kind(self) -> AbstractBodyCoordinates:
         return QuaternionBodies()
 
 

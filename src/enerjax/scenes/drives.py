@@ -6,35 +6,25 @@ A scene starts at `t = 0`, with the velocities that its drives prescribe there. 
 takes, force or torque, is its `scene.reaction`, and its power is in `sol.audit.drive_work`.
 """
 
-import abc
-from collections.abc import Callable
-
 import equinox as eqx
-from jaxtyping import Array
 
-from .._types import Args, Scalar, Vector
+from .._types import Vector
+from ._ends import Ends
 from ._frames import GROUND, Numbers
-from ._laws import Driven
+from ._laws import Driven, Signal
 from ._measures import AbstractLaw, Place, Separation, Slide, turn_of
 from ._names import only_parts
-from ._own import check_function
-from ._start import Ends
+from ._part import AbstractPart
+from ._user_functions import check_function
 
 
-class AbstractDrive(eqx.Module):
-    """A drive of a scene: `a` and `b` are names of bodies, or `"ground"`."""
+class AbstractDrive(AbstractPart):
+    """A drive of a scene."""
 
-    name: eqx.AbstractVar[str]
-    a: eqx.AbstractVar[str]
-    b: eqx.AbstractVar[str]
-    motion: eqx.AbstractVar[Callable[[Scalar, Args], Array]]
+    motion: eqx.AbstractVar[Signal]
 
     def __check_init__(self):
         check_function(self.name, "motion", self.motion, "t", "args")
-
-    @abc.abstractmethod
-    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
-        """Its law and its numbers, from the start pose of its bodies."""
 
 
 class Angle(AbstractDrive):
@@ -45,10 +35,7 @@ class Angle(AbstractDrive):
     common to both bodies; over any number of turns.
     """
 
-    name: str
-    a: str
-    b: str
-    motion: Callable[[Scalar, Args], Array]
+    motion: Signal
     axis: Vector | None = None
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
@@ -62,10 +49,7 @@ class Displacement(AbstractDrive):
     Points that are not given are the origins of the frames.
     """
 
-    name: str
-    a: str
-    b: str
-    motion: Callable[[Scalar, Args], Array]
+    motion: Signal
     point_a: Vector | None = None
     point_b: Vector | None = None
     axis: Vector | None = None
@@ -81,10 +65,7 @@ class Distance(AbstractDrive):
     Points that are not given are the origins of the frames.
     """
 
-    name: str
-    a: str
-    b: str
-    motion: Callable[[Scalar, Args], Array]
+    motion: Signal
     point_a: Vector | None = None
     point_b: Vector | None = None
 
@@ -99,17 +80,14 @@ class Position(AbstractDrive):
     The point is the mass centre if it is not given.
     """
 
-    name: str
-    a: str
-    b: str
-    motion: Callable[[Scalar, Args], Array]
+    motion: Signal
     point: Vector | None
 
     def __init__(
         self,
         name: str,
         body: str,
-        motion: Callable[[Scalar, Args], Array],
+        motion: Signal,
         point: Vector | None = None,
     ):
         self.name, self.a, self.b = name, GROUND, body

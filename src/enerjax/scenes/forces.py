@@ -5,14 +5,9 @@ they bring in is in `sol.audit.work`, and their functions are those of the time 
 `args` of the system.
 """
 
-from collections.abc import Callable
-from typing import Any
-
-import equinox as eqx
-from jaxtyping import Array
-
-from .._types import Args, Real, Vector
-from ._forces import AbstractForce as AbstractForce
+from .._types import Real, Vector
+from ._arguments import number
+from ._ends import Ends
 from ._frames import GROUND, Numbers
 from ._laws import Elastic, Steady
 from ._loads import (
@@ -25,9 +20,7 @@ from ._loads import (
 )
 from ._measures import AbstractLaw, Place, PlanarTurn, Separation, Turn
 from ._names import only_parts
-from ._numbers import number
-from ._own import check_function
-from ._start import Ends
+from ._part import AbstractForce as AbstractForce, AbstractFunctionOfPose, PoseFunction
 
 
 class Spring(AbstractForce):
@@ -37,9 +30,6 @@ class Spring(AbstractForce):
     is that of the start. The points must not meet, where the direction is undefined.
     """
 
-    name: str
-    a: str
-    b: str
     stiffness: Real
     length: Real | None = None
     point_a: Vector | None = None
@@ -64,9 +54,6 @@ class TorsionSpring(AbstractForce):
     jumps at half a turn there: keep away from it.
     """
 
-    name: str
-    a: str
-    b: str
     stiffness: Real
     angle: Real | None = None
     axis: Vector | None = None
@@ -90,9 +77,6 @@ class ConstantForce(AbstractForce):
     `force` has two or three entries; `point` is the mass centre if it is not given.
     """
 
-    name: str
-    a: str
-    b: str
     force: Vector
     point: Vector | None
 
@@ -112,9 +96,6 @@ class ConstantTorque(AbstractForce):
     Its opposite acts on `reacting`.
     """
 
-    name: str
-    a: str
-    b: str
     torque: Real
 
     def __init__(self, name: str, body: str, torque: Real, reacting: str = GROUND):
@@ -128,7 +109,7 @@ class ConstantTorque(AbstractForce):
         return Steady(PlanarTurn(), "torque"), dict(torque=torque)
 
 
-class Potential(eqx.Module):
+class Potential(AbstractFunctionOfPose):
     """A potential of your own: `function(view, args)`, a scalar (energy).
 
     `view` tells where the bodies are: `view.position(body, point)`,
@@ -136,10 +117,7 @@ class Potential(eqx.Module):
     """
 
     name: str
-    function: Callable[[Any, Args], Array]
-
-    def __check_init__(self):
-        check_function(self.name, "function", self.function, "view", "args")
+    function: PoseFunction
 
 
 __dir__ = only_parts(globals())

@@ -11,67 +11,58 @@ joint in either body, `frame_a` and `frame_b`, as rows (the axis comes last in s
 in the plane).
 """
 
-import abc
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._types import Args, Real, Vector
+from .._types import Real, Vector
+from ._arguments import module_of, positive
+from ._ends import Ends
 from ._frames import Numbers
 from ._laws import Alignment, Curve, Length
 from ._measures import AbstractLaw
 from ._names import only_parts
-from ._numbers import module_of, positive
-from ._own import check_function, vector_of
-from ._start import Ends
+from ._part import AbstractFunctionOfPose, AbstractPart, PoseFunction
+from ._user_functions import check_function, vector_of
 
 
-class AbstractJoint(eqx.Module):
-    """A joint of a scene: `a` and `b` are names of bodies, or `"ground"`."""
-
-    name: eqx.AbstractVar[str]
-    a: eqx.AbstractVar[str]
-    b: eqx.AbstractVar[str]
-
-    @abc.abstractmethod
-    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
-        """Its law and its numbers, from the start pose of its bodies."""
+class AbstractJoint(AbstractPart):
+    """A joint of a scene."""
 
 
-class Spherical(AbstractJoint):
+class AbstractPointJoint(AbstractJoint):
+    """A joint of a point of the first body and a point of the second."""
+
+    point_a: Vector | None = None
+    point_b: Vector | None = None
+
+
+class AbstractAxisJoint(AbstractPointJoint):
+    """A joint of two points, an `axis` in the first body and `axis_b` in the second."""
+
+    axis: Vector | None = None
+    axis_b: Vector | None = None
+
+
+class Spherical(AbstractPointJoint):
     """Holds two points together: a ball joint, three constraints in space.
 
     Their multipliers are minus the force on the second body.
     """
 
-    name: str
-    a: str
-    b: str
-    point_a: Vector | None = None
-    point_b: Vector | None = None
-
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         return Alignment(None), ends.points(self.point_a, self.point_b)
 
 
-class Revolute(AbstractJoint):
+class Revolute(AbstractAxisJoint):
     """Holds two points together, and in space an axis: a pin or hinge.
 
     Two constraints in the plane, where there is no `axis` to give, five in space. `axis`
     is told in the first body, `axis_b` in the second.
     """
-
-    name: str
-    a: str
-    b: str
-    point_a: Vector | None = None
-    point_b: Vector | None = None
-    axis: Vector | None = None
-    axis_b: Vector | None = None
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         points = ends.points(self.point_a, self.point_b)
@@ -82,19 +73,11 @@ class Revolute(AbstractJoint):
         return law, points | ends.axes(self.axis, self.axis_b)
 
 
-class Universal(AbstractJoint):
+class Universal(AbstractAxisJoint):
     """Holds two points together and two axes perpendicular: a Cardan joint, in space.
 
     Four constraints. `axis` is fixed in the first body, `axis_b` in the second.
     """
-
-    name: str
-    a: str
-    b: str
-    point_a: Vector | None = None
-    point_b: Vector | None = None
-    axis: Vector | None = None
-    axis_b: Vector | None = None
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         ends.only_in_space("A universal joint")
@@ -102,17 +85,12 @@ class Universal(AbstractJoint):
         return Alignment(None, ((2, 2),)), points | ends.two_axes(self.axis, self.axis_b)
 
 
-class Prismatic(AbstractJoint):
+class Prismatic(AbstractPointJoint):
     """Lets a body slide along an axis of the first body, and turn about none.
 
     Two constraints in the plane, five in space.
     """
 
-    name: str
-    a: str
-    b: str
-    point_a: Vector | None = None
-    point_b: Vector | None = None
     axis: Vector | None = None
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
@@ -122,19 +100,11 @@ class Prismatic(AbstractJoint):
         return Alignment((0, 1), ((0, 1), (1, 2), (2, 0))), numbers
 
 
-class Cylindrical(AbstractJoint):
+class Cylindrical(AbstractAxisJoint):
     """Lets a body slide along an axis of the first body and turn about it, in space.
 
     Four constraints.
     """
-
-    name: str
-    a: str
-    b: str
-    point_a: Vector | None = None
-    point_b: Vector | None = None
-    axis: Vector | None = None
-    axis_b: Vector | None = None
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         ends.only_in_space("A cylindrical joint")
@@ -143,19 +113,11 @@ class Cylindrical(AbstractJoint):
         return law, numbers | ends.axes(self.axis, self.axis_b)
 
 
-class Planar(AbstractJoint):
+class Planar(AbstractAxisJoint):
     """Lets a body slide and turn in the plane of the first body that `axis` is normal to.
 
     Three constraints, in space.
     """
-
-    name: str
-    a: str
-    b: str
-    point_a: Vector | None = None
-    point_b: Vector | None = None
-    axis: Vector | None = None
-    axis_b: Vector | None = None
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         ends.only_in_space("A planar joint")
@@ -164,17 +126,11 @@ class Planar(AbstractJoint):
         return law, numbers | ends.axes(self.axis, self.axis_b)
 
 
-class Fixed(AbstractJoint):
+class Fixed(AbstractPointJoint):
     """Holds two bodies in the relative pose of the start.
 
     Three constraints in the plane, six in space.
     """
-
-    name: str
-    a: str
-    b: str
-    point_a: Vector | None = None
-    point_b: Vector | None = None
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         axis = [1.0, 0.0, 0.0][: ends.dimension]
@@ -183,18 +139,13 @@ class Fixed(AbstractJoint):
         return Alignment(None, square), numbers
 
 
-class Distance(AbstractJoint):
+class Distance(AbstractPointJoint):
     """Holds two points at a distance: a rod without mass. One constraint.
 
     Points that are not given are the origins of the frames, a `length` (positive) that is
     not given is that of the start. The points must not meet.
     """
 
-    name: str
-    a: str
-    b: str
-    point_a: Vector | None = None
-    point_b: Vector | None = None
     length: Real | None = None
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
@@ -212,9 +163,6 @@ class OnCurve(AbstractJoint):
     of floats given here, found again in `args["joints"][name]`.
     """
 
-    name: str
-    a: str
-    b: str
     curve: Callable[[Array, Numbers], Array]
     numbers: Numbers = eqx.field(default_factory=dict)
     point_b: Vector | None = None
@@ -233,7 +181,7 @@ class OnCurve(AbstractJoint):
         return Curve(self.curve), own | dict(point_b=point)
 
 
-class Constraint(eqx.Module):
+class Constraint(AbstractFunctionOfPose):
     """A constraint of your own: `function(view, args)`, a vector that vanishes.
 
     `view` tells where the bodies are: `view.position(body, point)`,
@@ -241,10 +189,7 @@ class Constraint(eqx.Module):
     """
 
     name: str
-    function: Callable[[Any, Args], Array]
-
-    def __check_init__(self):
-        check_function(self.name, "function", self.function, "view", "args")
+    function: PoseFunction
 
 
 __dir__ = only_parts(globals())

@@ -12,15 +12,15 @@ from .._programs import is_known
 from .._run import Solution
 from .._system import State, System
 from .._types import Coordinates, Real, Vector
-from ._closing import check_poses, closed_start, gaps_of, Told
 from ._compile import compile_parts, join, sort_parts
+from ._constraint_rows import check_reacting, row_names, rows_of
+from ._feedback import Moving
 from ._functions import make_system
 from ._gaps import Gap, Measured
-from ._motions import each, Reaction, reaction
-from ._moving import Moving
 from ._parameters import Parameters
 from ._readouts import measured_along, Readout
-from ._rows import check_reacting, row_names, rows_of
+from ._relative_motions import each, Reaction, reaction
+from ._start import check_poses, closed_start, gaps_of, Told
 from ._summary import summary
 from ._view import View
 from .bodies import AbstractBody

@@ -46,7 +46,13 @@ def dissipative_stiffness(step: StepProblem, alpha: Scalar) -> DissipativeStiffn
     none, tau = jnp.zeros((0, 0), h.dtype), alpha * h / 6
     if isinstance(matrix, Assembled):
         inverse_inertia = model.inverse_metric(middle)
-        return DissipativeStiffness(matrix, inertia, inverse_inertia, none, none)
+        return DissipativeStiffness(
+            matrix=matrix,
+            inertia=inertia,
+            inverse_inertia=inverse_inertia,
+            jump_matrix=none,
+            velocity_matrix=none,
+        )
     inertia = as_dense(inertia)
     jump_matrix = product(inverse(inertia + tau**2 * matrix), h / 6 * matrix)
     if model.has_own_momenta:

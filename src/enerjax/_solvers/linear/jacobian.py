@@ -21,7 +21,7 @@ from ..._programs import (
 )
 from .banded import Band, coloured_products, column_colours
 from .dense import AbstractFactors, Inverse, inverse, LU, SMALL, solve
-from .given import KLU, LineaxFactors, Scattered
+from .user_solver import KLU, LineaxFactors, Scattered
 
 
 class Full:

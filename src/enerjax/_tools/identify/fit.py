@@ -117,17 +117,17 @@ def _fit(residuals, unknowns, numbers, data, solver, max_steps, guess):
     iterations = jnp.asarray(sought.stats["num_steps"])
     each = 2 if isinstance(solver, optx.AbstractMinimiser) else x.size + 1
     found = Fit(
-        unknowns.parameters(x),
-        unknowns.unravel(slopes * error),
-        unknowns.parameters(x - half),
-        unknowns.parameters(x + half),
-        slopes[:, None] * spread * slopes[None],
-        cost,
-        iterations,
-        iterations * each + x.size + 1,
-        sought.result,
-        freedom,
-        names,
+        parameters=unknowns.parameters(x),
+        standard_errors=unknowns.unravel(slopes * error),
+        lower=unknowns.parameters(x - half),
+        upper=unknowns.parameters(x + half),
+        covariance=slopes[:, None] * spread * slopes[None],
+        cost=cost,
+        iterations=iterations,
+        simulations=iterations * each + x.size + 1,
+        result=sought.result,
+        degrees_of_freedom=freedom,
+        names=names,
     )
     return found, weak
 

@@ -72,7 +72,14 @@ def measure(
     if not counts:
         raise ValueError("`steps` is empty: give numbers of steps, such as [100, 200].")
     times, data = _times(reference, counts, float(duration), float(t0))
-    task = Task(system, start, args, float(t0), float(duration), times)
+    task = Task(
+        system=system,
+        start=start,
+        args=args,
+        t0=float(t0),
+        duration=float(duration),
+        times=times,
+    )
     for count in counts:
         task.rows(count)
     known = _known(task, reference, data, counts[-1])
@@ -81,7 +88,9 @@ def measure(
         for name, scheme in schemes.items()
     }
     h = duration / np.array(counts)
-    return Runs(dict(schemes), counts, h, runs, known.uncertainty)
+    return Runs(
+        schemes=dict(schemes), steps=counts, h=h, runs=runs, uncertainty=known.uncertainty
+    )
 
 
 def _check(schemes: Any, duration: float) -> None:

@@ -10,8 +10,8 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
+from .checksums import add_array, checksum
 from .grid import Grid
-from .hashing import add_array, checksum
 
 
 def fingerprint(grid: Grid, chunks: np.ndarray, traced: Any) -> dict[str, str]:

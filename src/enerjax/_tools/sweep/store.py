@@ -10,7 +10,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from .hashing import checksum
+from .checksums import checksum
 
 
 # Seconds after which a draft that nobody writes to is what a killed process left.

@@ -8,8 +8,8 @@ from jaxtyping import Array
 from .._types import Coordinates, Real
 from ._functions import constraint, driven, drives_at, redundancy
 from ._layout import Layout
-from ._own import vector_of
 from ._parameters import Parameters
+from ._user_functions import vector_of
 from ._view import evaluate, View
 
 

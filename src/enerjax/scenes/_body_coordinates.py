@@ -16,7 +16,7 @@ from .._types import Coordinates, Multipliers, Scalar, Velocities
 from ._frames import Numbers, Point
 
 
-class AbstractKind(abc.ABC):
+class AbstractBodyCoordinates(abc.ABC):
     """How a body of some kind moves.
 
     - `dimension`: 2 in the plane, 3 in space.
@@ -77,7 +77,7 @@ def translation(v: Velocities, numbers: Numbers) -> Scalar:
 
 
 @dataclass(frozen=True)
-class Points(AbstractKind):
+class Points(AbstractBodyCoordinates):
     """`q`: position."""
 
     dimension: int
@@ -92,7 +92,7 @@ class Points(AbstractKind):
 
 
 @dataclass(frozen=True)
-class PlanarBodies(AbstractKind):
+class PlanarBodies(AbstractBodyCoordinates):
     """`q`: mass centre and angle."""
 
     dimension: int = 2
@@ -118,7 +118,7 @@ _LEFT, _RIGHT = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
 
 
 @dataclass(frozen=True)
-class DirectorBodies(AbstractKind):
+class DirectorBodies(AbstractBodyCoordinates):
     """`q`: mass centre and the three body axes, as vectors in space."""
 
     dimension: int = 3
@@ -156,7 +156,7 @@ def rotation(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
 
 
 @dataclass(frozen=True)
-class QuaternionBodies(AbstractKind):
+class QuaternionBodies(AbstractBodyCoordinates):
     """`q`: mass centre and unit quaternion; `v`: its velocity, and the angular velocity
     in body axes."""
 

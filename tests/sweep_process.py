@@ -1,6 +1,7 @@
 """A small sweep, also as a process of its own: killed, resumed, or one of several.
 
-python -m tests.swept RESULT [--path FOLDER] [--die-after LANES] [--process K --port P]
+python -m tests.sweep_process RESULT [--path FOLDER] [--die-after LANES]
+                             [--process K --port P]
 """
 
 import argparse
@@ -29,7 +30,7 @@ def motion(l, h, g):
     return {"q": solution.ys.q[-1], "drift": drift, "result": solution.result}
 
 
-def swept(**options):
+def run_sweep(**options):
     return ej.sweep(motion, OVER, chunk=8, **options)
 
 
@@ -49,7 +50,7 @@ def main():
         if options.die_after is not None and done >= options.die_after:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    found = swept(path=options.path, progress=progress)
+    found = run_sweep(path=options.path, progress=progress)
     np.savez(options.result, q=found.values["q"], drift=found.values["drift"])
 
 

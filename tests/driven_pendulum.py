@@ -1,4 +1,4 @@
-"""A pendulum whose pivot is shaken, and the schemes that it is driven with."""
+"""A pendulum whose pivot is moved, and the schemes that it is driven with."""
 
 import jax
 import jax.numpy as jnp
@@ -35,10 +35,10 @@ def moved_rod(q, t, args):
     return jnp.array([rod @ rod - args["l"] ** 2])
 
 
-SHAKEN = ej.System(kinetic, potential, driven=moved_rod)
+DRIVEN_PENDULUM = ej.System(kinetic, potential, driven=moved_rod)
 
 
-def shaken_start(t=0.2, args=ARGS):
+def driven_start(t=0.2, args=ARGS):
     """Horizontal, and at rest against the pivot, as far as the constraint lets it."""
     at, rate = jax.jvp(lambda t: pivot(t, args), (t,), (1.0,))
-    return ej.initial_state(SHAKEN, at + jnp.array([1.0, 0.0]), rate, args, t=t)
+    return ej.initial_state(DRIVEN_PENDULUM, at + jnp.array([1.0, 0.0]), rate, args, t=t)

@@ -17,8 +17,8 @@ def rods_gradient(q):
     return 2 * np.array([[*q[:2], *zero], [*-outer, *outer]])
 
 
-def rattle_by_hand(q, v, h, steps):
-    """Two unit masses: shaken onto the rods, then the velocities projected."""
+def rattle(q, v, h, steps):
+    """Two unit masses: moved back onto the rods, then the velocities projected."""
     for _ in range(steps):
         gradient, impulse = rods_gradient(q), np.zeros(2)
         middle = v + h / 2 * GRAVITY
@@ -34,7 +34,7 @@ def rattle_by_hand(q, v, h, steps):
     return q, v
 
 
-def alpha_by_hand(q, v, a, vdot, h, steps, rho):
+def generalized_alpha(q, v, a, vdot, h, steps, rho):
     """By the residual of Arnold and Bruls, in `a1` and `lambda`."""
     alpha_m, alpha_f = (2 * rho - 1) / (rho + 1), rho / (rho + 1)
     gamma = 0.5 + alpha_f - alpha_m
