@@ -28,8 +28,8 @@ def is_type_checked(request):
     return bool(request.config.getoption("--jaxtyping-packages", None))
 
 
-# Tracing allocates millions of small objects that live for long. Python looks through all of
-# them for cycles so often, with its own settings, that a twelfth of the time goes there.
+# Tracing allocates millions of small objects that live for long. With its own settings,
+# Python searches them for cycles so often that a twelfth of the time goes there.
 gc.set_threshold(50_000, 20, 100)
 
 # A process can map only so many pieces of memory, 65530 on most machines, and each compiled
