@@ -170,7 +170,7 @@ def test_mobility_of_an_over_constrained_loop():
     system, pose = _parallelogram(offset=0.1)
     found = ej.mobility(system, pose)
     assert 3 in found.inconsistent
-    with pytest.raises(ValueError, match="2 names for 4 rows"):
+    with pytest.raises(ValueError, match="2 names for 4 constraints"):
         ej.mobility(system, pose, names=["a", "b"])
 
 

@@ -1,8 +1,8 @@
-"""The main job: every scheme of the paper, and ours, on its four test cases.
+"""The main job: all schemes on the four test cases of E. Lens and A. Cardona.
 
     python -m enerjax [--out FOLDER] [--quick]
 
-Prints one table, and writes it as CSV with counterparts of the figures of the paper.
+It prints a table, writes it as CSV, and draws the counterparts of the paper's figures.
 """
 
 import argparse
@@ -54,7 +54,7 @@ def main(arguments: list[str] | None = None) -> None:
     begin = time.perf_counter()
     options = _parse(arguments)
     jax.config.update("jax_enable_x64", True)
-    # Not before the options are known to be good: this import takes the longest.
+    # Imported after the options have been checked, because this import is slow.
     from ._tools.report import figures, runs, table
 
     done = runs.run_all(options.quick, _progress)
@@ -73,6 +73,6 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    # Of this process alone: who calls `main` decides for theirs.
+    # Not in `main`: whoever calls that decides for their own process.
     enable_fast_loops()
     main()

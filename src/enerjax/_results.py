@@ -1,4 +1,4 @@
-"""How a step can end. Failures are values: each step of each lane carries one."""
+"""The outcomes of a step. A failure is a value that each step of each lane returns."""
 
 import equinox as eqx
 import jax
@@ -9,20 +9,19 @@ from ._types import Flag
 
 
 class RESULTS(eqx.Enumeration):
-    """The outcome of a step or of a run; the message says what to do about it."""
+    """The outcome of a step or of a run; the message of a failure names its remedy."""
 
     successful = "successful"
     not_converged = (
         "Newton's method did not converge. The step may be too long for the motion: "
-        "reduce `h`, or let steps that fail be divided: `max_halvings=4`, or let a "
+        "reduce `h`, let failed steps be divided (`max_halvings=4`), or let a "
         "`StepController` choose the steps. Vibrations of stiff springs that no step can "
         "resolve are damped by `EnergyConsistent(1.0)` or `EnergyDecaying(1.0)`."
     )
     singular = (
-        "The step equations became singular. Constraints may repeat each other (declare "
-        "that: `System(..., redundant=True)`; `enerjax.mobility` names their rows), or the "
-        "mechanism passes a pose where they lose their independence: another `h` may miss "
-        "it."
+        "The step equations became singular. Constraints may be redundant (declare "
+        "`System(..., redundant=True)`; `enerjax.mobility` names them), or the mechanism "
+        "passes a pose where they lose their independence: another `h` may avoid it."
     )
     nonfinite = (
         "The step equations became non-finite. A function of the system may be undefined "
@@ -30,38 +29,39 @@ class RESULTS(eqx.Enumeration):
     )
     step_too_large = (
         "A constraint turned by more than a right angle in this step: the step is far too "
-        "long for the motion, or has met a solution on the other side of a joint. Reduce "
-        "`h`, or let steps that fail be divided: `max_halvings=3`."
+        "long for the motion, or ended in a solution on the wrong side of a joint. Reduce "
+        "`h`, or let failed steps be divided: `max_halvings=3`."
     )
     inconsistent_start = (
-        "The start does not satisfy the constraints that this scheme holds. Make it "
+        "The start does not satisfy the constraints that this scheme enforces. Create it "
         "with `initial_state(system, q, v, args)`, which projects it onto them."
     )
     kappa_out_of_range = (
         "kappa left (0, 2): the kinetic energy hardly changed in this step, and kappa is "
-        "defined by a division by that change, so that nothing bounds the energy any "
-        "more. This is a limit of the scheme, not of the step: use `EnergyDecaying` or "
+        "defined by a division by that change, so nothing bounds the energy any more. "
+        "This is a limit of the scheme, not of the step: use `EnergyDecaying` or "
         "`EnergyConsistent`."
     )
     out_of_steps = (
-        "The end time is not reached within `max_steps`. Raise `max_steps`, lengthen `h`, "
-        "or loosen the tolerances of the controller."
+        "The run did not reach its end time within `max_steps`. Raise `max_steps`, "
+        "lengthen `h`, or loosen the tolerances of the controller."
     )
     steps_too_short = (
-        "The tolerances of the controller ask for steps that vanish beside the length of "
-        "the run. Loosen `rtol` and `atol`: what Newton's method leaves, about 1e-14 of "
-        "the coordinates, is not below any tolerance; or the motion has a singularity "
-        "here (a collision)."
+        "The controller asks for steps that are negligible beside the length of the run. "
+        "Loosen `rtol` and `atol`: they must stay above the residual of Newton's method, "
+        "about 1e-14 of the coordinates. Or the motion has a singularity here, such as a "
+        "collision."
     )
 
 
 def first_failure(old: RESULTS, new: RESULTS) -> RESULTS:
-    """`old` unless it is a success."""
+    """`old` if it is a failure, else `new`."""
     return RESULTS.where(old == RESULTS.successful, new, old)
 
 
 def from_root_finder(found: Flag, broken: Flag, finite: Flag) -> RESULTS:
-    """What the end of an iteration, with a finite residual or not, means for a step."""
+    """The outcome of a step: whether a root was found, whether the iteration broke down,
+    and whether its residual was finite."""
     breakdown = RESULTS.where(finite, RESULTS.singular, RESULTS.nonfinite)
     failure = RESULTS.where(broken, breakdown, RESULTS.not_converged)
     return RESULTS.where(found, RESULTS.successful, failure)
@@ -75,17 +75,17 @@ def first_of(results: RESULTS) -> RESULTS:
 
 
 def meanings(outcomes: RESULTS) -> np.ndarray:
-    """What each outcome means, in a few words, in an array of their shape."""
+    """The first words of the message of each outcome, in an array of their shape."""
     (codes,) = jax.tree.leaves(outcomes)
-    known, places = np.unique(codes, return_inverse=True)
-    # The only name of an outcome that all enumerations show is their text for one.
+    known, positions = np.unique(codes, return_inverse=True)
+    # `str` is the only way to a message that works for every enumeration of optimistix.
     texts = [str(jax.tree.map(lambda _, c=c: np.asarray(c), outcomes)) for c in known]
-    told = [text.partition("<")[2].removesuffix(">") or "successful" for text in texts]
-    words = np.array([text.partition(". ")[0].partition(":")[0] for text in told])
-    return words[places].reshape(np.shape(codes))
+    messages = [x.partition("<")[2].removesuffix(">") or "successful" for x in texts]
+    words = np.array([x.partition(". ")[0].partition(":")[0] for x in messages])
+    return words[positions].reshape(np.shape(codes))
 
 
 def tally(outcomes: RESULTS) -> str:
-    """How often each outcome occurs: `3 successful, 1 Newton's method did not converge`."""
+    """The outcomes, counted: `3 successful, 1 Newton's method did not converge`."""
     causes, numbers = np.unique(meanings(outcomes), return_counts=True)
     return ", ".join(f"{n} {c}" for n, c in zip(numbers, causes, strict=True))

@@ -1,4 +1,4 @@
-"""Poses in which a system can rest."""
+"""Static equilibria."""
 
 from collections.abc import Callable
 from typing import Any
@@ -15,13 +15,15 @@ from .._system import AbstractSystem, check_system, HamiltonianSystem, State
 from .._types import Args, Coordinates, Flag, Multipliers, Real, Scalar
 
 
-# Newton may wander before it converges, on long chains for one.
+# Long chains need many iterations: Newton's method wanders there before it converges.
 _MAX_ITERATIONS = 200
-# Of one attempt on the way down, and how many there are.
-_PATIENCE = 30
-_AT_ONCE = 8
-_TRIES = 100
-# The part of the first weight that is left out next.
+# The descent makes so many attempts, of so many iterations each.
+_MAX_ATTEMPTS = 100
+_ITERATIONS_OF_ATTEMPT = 30
+# Without springs an attempt must converge within so many iterations. A longer search can
+# end in any pose, even many turns away.
+_ITERATIONS_WITHOUT_SPRINGS = 8
+# Springs that are softer than this fraction of the first ones are removed.
 _SOFTEST = 1e-6
 
 
@@ -45,27 +47,27 @@ def equilibrium(
     t: Real = 0.0,
     root_finder: RootFinder = Newton(),
 ) -> Equilibrium:
-    """A pose where `dV/dq + B^T lambda = L^T f` and `Phi = 0`, from a guess.
+    """Finds a pose where `dV/dq + B^T lambda = L^T f` and `Phi = 0`, from a guess.
 
-    By Newton's method from a guess near it; from others by the way of a body that creeps
-    down its potential, which ends in a pose that is stable.
+    If the guess is near an equilibrium, Newton's method finds it. Otherwise the pose
+    descends the potential, as an overdamped body would, until it is near a stable one.
 
-    Differentiable with respect to `args` by the implicit function theorem. What is found
-    at once can be unstable, as a pendulum on its head: `modes` tells.
+    The pose can be differentiated with respect to `args` (implicit function theorem). An
+    equilibrium near the guess may be unstable, as an inverted pendulum is: `modes` tells.
 
     **Arguments:**
 
     - `system`, `args`: as for `simulate`.
-    - `guess`: its coordinates need not satisfy the constraints, its velocities do not
-      matter. Far from an equilibrium let a damped run come close to one.
-    - `t`: the time at which forces and drives are taken to stand still.
+    - `guess`: its coordinates need not satisfy the constraints, and its velocities are
+      ignored. If it is far from an equilibrium, let a damped run come closer first.
+    - `t`: the time at which forces and drives are frozen.
     - `root_finder`: for equations that are scaled to order one; see `simulate`.
 
     **Returns:** an `Equilibrium`.
 
-    **Raises:** `ValueError` if none is found, under `jit`, `vmap` and `grad`
-    `equinox.EquinoxRuntimeError`; `ValueError` and `TypeError` for bad input, and for a
-    `System.from_hamiltonian`, which can be in balance while its momenta do not vanish.
+    **Raises:** `ValueError` if no equilibrium is found (under `jit`, `vmap` and `grad`
+    `equinox.EquinoxRuntimeError`); `ValueError` and `TypeError` for bad input, and for a
+    `System.from_hamiltonian`, whose momenta need not vanish in equilibrium.
     """
     rest, args = at_rest(system, guess, args, t)
     found, residual, ok = _solve(system, rest, args, root_finder)
@@ -84,11 +86,11 @@ def equilibrium(
 def at_rest(
     system: AbstractSystem, state: State, args: Args, t: Real
 ) -> tuple[State, Args]:
-    """Checked input of an analysis of a system that rests."""
+    """The checked arguments of an analysis, with the system at rest."""
     if isinstance(system, HamiltonianSystem):
         raise ValueError(
-            "Equilibria and modes are those of a system at rest; that of a Hamiltonian "
-            "need not have vanishing momenta. Describe it by `System` or "
+            "Equilibria and modes are defined for a system at rest, and the momenta of a "
+            "Hamiltonian system need not vanish there. Describe it by `System` or "
             "`System.from_lagrangian`."
         )
     state, args = check_system(system, state, args, t)
@@ -101,93 +103,95 @@ def _solve(
 ) -> tuple[Equilibrium, Scalar, Flag]:
     model = make_model(system, guess, args)
     scales = model.scales
-    q0, size = guess.q, _size(model, guess)
+    q0, size = guess.q, _force_size(model, guess)
     unit = size / scales.coordinate
 
     def balance(x, inputs):
-        model, unit, size, held, weight = inputs
-        shift, tension = x
+        model, unit, size, anchor, stiffness = inputs
+        shift, scaled_multipliers = x
         q = q0 + unit * shift
-        constraint, pull = jax.vjp(lambda q: model.constraint(q, guess.t), q)
+        constraint, transpose = jax.vjp(lambda q: model.constraint(q, guess.t), q)
         slope = model.slope(State(q, guess.v, guess.t))
-        force = slope + pull(size * tension / scales.constraint)[0]
+        force = slope + transpose(size * scaled_multipliers / scales.constraint)[0]
         rows = size * scales.constraint + scales.constraint_size
-        force = force / (size * scales.coordinate) + weight * (shift - held)
+        force = force / (size * scales.coordinate) + stiffness * (shift - anchor)
         return force, constraint / rows
 
-    # The multipliers that come closest to balance: there are more rows than these.
-    pull = jax.jacfwd(model.constraint)(q0, guess.t) / scales.coordinate[None]
-    pull = pull / scales.constraint[:, None]
+    # The balance has more rows than there are multipliers: these come closest to it.
+    jacobian = jax.jacfwd(model.constraint)(q0, guess.t) / scales.coordinate[None]
+    jacobian = jacobian / scales.constraint[:, None]
     slope = model.slope(guess) / scales.coordinate
-    tension = jnp.linalg.lstsq(pull.T, -slope)[0] / size
-    zero = (jnp.zeros_like(q0), tension)
+    scaled_multipliers = jnp.linalg.lstsq(jacobian.T, -slope)[0] / size
+    first = (jnp.zeros_like(q0), scaled_multipliers)
     inputs = (model, unit, size)
-    none = jnp.zeros_like(q0), jnp.zeros_like(size)
-    near = lambda x, held: balance(x, (*inputs, *held))
-    near = _come_near(near, root_finder, zero, _stiffness(near, zero, q0 / unit))
+    no_springs = jnp.zeros_like(q0), jnp.zeros_like(size)
+    with_springs = lambda x, springs: balance(x, (*inputs, *springs))
+    stiffness = _stiffness_above_potential(with_springs, first, q0 / unit)
+    near = _descend(with_springs, root_finder, first, stiffness)
     root = find_root(
-        balance, root_finder, near, (*inputs, *none), max_iterations=_MAX_ITERATIONS
+        balance, root_finder, near, (*inputs, *no_springs), max_iterations=_MAX_ITERATIONS
     )
-    shift, tension = root.value
+    shift, scaled_multipliers = root.value
     q: Coordinates = q0 + unit * shift
-    multipliers = size * tension / scales.constraint
-    residual = largest(jnp.concatenate(balance(root.value, (*inputs, *none))))
+    multipliers = size * scaled_multipliers / scales.constraint
+    residual = largest(jnp.concatenate(balance(root.value, (*inputs, *no_springs))))
     return Equilibrium(State(q, guess.v), multipliers), residual, root.found
 
 
-def _come_near(
+def _descend(
     balance: Callable[[Any, tuple[Array, Scalar]], Any],
     root_finder: RootFinder,
     guess: tuple[Array, Array],
-    stiff: Scalar,
+    first_stiffness: Scalar,
 ) -> tuple[Array, Array]:
-    """A point from which Newton's method finds the balance, or the guess.
+    """A point from which Newton's method converges to an equilibrium, or the guess.
 
-    Where it does not find it in a few iterations it goes down the potential, step by
-    step: to where springs of some stiffness, the weight, that hold it to where it was
-    would let it come to rest. They are made softer where it does, and harder where that
-    fails too.
+    The first attempt has no springs. If it fails, springs tie the system to its pose, and
+    each attempt finds the equilibrium with these springs, which is a step down the
+    potential. The springs of the next attempt are softer after a success, and stiffer
+    after a failure.
     """
 
     def unfinished(carry):
-        _, _, ok, tries = carry
-        return ~ok & (tries < _TRIES)
+        _, _, done, attempts = carry
+        return ~done & (attempts < _MAX_ATTEMPTS)
 
     def attempt(carry):
-        x, weight, _, tries = carry
-        held = jax.lax.stop_gradient((x[0], weight))
-        root = find_root(balance, root_finder, x, held, max_iterations=_PATIENCE)
-        good = root.found & jnp.isfinite(root.residual)
-        # A search that wanders ends in whatever pose it meets, many turns away.
-        good = good & ((weight > 0) | (root.iterations <= _AT_ONCE))
+        x, stiffness, _, attempts = carry
+        springs = jax.lax.stop_gradient((x[0], stiffness))
+        root = find_root(
+            balance, root_finder, x, springs, max_iterations=_ITERATIONS_OF_ATTEMPT
+        )
+        was_quick = root.iterations <= _ITERATIONS_WITHOUT_SPRINGS
+        good = root.found & jnp.isfinite(root.residual) & ((stiffness > 0) | was_quick)
         x = jax.tree.map(lambda new, old: jnp.where(good, new, old), root.value, x)
-        softer = jnp.where(weight > _SOFTEST * stiff, weight / 4, 0)
-        harder = jnp.where(weight > 0, 16 * weight, stiff)
-        return x, jnp.where(good, softer, harder), good & (weight == 0), tries + 1
+        softer = jnp.where(stiffness > _SOFTEST * first_stiffness, stiffness / 4, 0)
+        stiffer = jnp.where(stiffness > 0, 16 * stiffness, first_stiffness)
+        done = good & (stiffness == 0)
+        return x, jnp.where(good, softer, stiffer), done, attempts + 1
 
-    no_weight = jnp.zeros((), guess[0].dtype)
-    begin = guess, no_weight, jnp.array(False), jnp.array(0)
-    x, _, ok, _ = jax.lax.while_loop(unfinished, attempt, jax.lax.stop_gradient(begin))
-    return jax.tree.map(lambda new, old: jnp.where(ok, new, old), x, guess)
+    begin = guess, jnp.zeros((), guess[0].dtype), jnp.array(False), jnp.array(0)
+    x, _, done, _ = jax.lax.while_loop(unfinished, attempt, jax.lax.stop_gradient(begin))
+    return jax.tree.map(lambda new, old: jnp.where(done, new, old), x, guess)
 
 
-def _stiffness(
+def _stiffness_above_potential(
     balance: Callable[[Any, tuple[Array, Scalar]], Any],
     guess: tuple[Array, Array],
-    place: Array,
+    scaled_q: Array,
 ) -> Scalar:
-    """A weight that is stiffer than the potential, as the guess shows it."""
-    no_weight = jnp.zeros_like(guess[0]), jnp.zeros((), place.dtype)
-    along = jnp.cos(jnp.arange(place.size, dtype=place.dtype))
+    """A stiffness above that of the potential, which is estimated at the guess."""
+    no_springs = jnp.zeros_like(guess[0]), jnp.zeros((), scaled_q.dtype)
+    along = jnp.cos(jnp.arange(scaled_q.size, dtype=scaled_q.dtype))
     (force, _), (change, _) = jax.jvp(
-        lambda x: balance((x, guess[1]), no_weight), (guess[0],), (along,)
+        lambda x: balance((x, guess[1]), no_springs), (guess[0],), (along,)
     )
-    stiff = largest(change) + largest(force) / (largest(place) + 1e-3)
-    return jnp.where(stiff > 0, 16 * stiff, 1)
+    stiffness = largest(change) + largest(force) / (largest(scaled_q) + 1e-3)
+    return jnp.where(stiffness > 0, 16 * stiffness, 1)
 
 
-def _size(model: AbstractModel, guess: State) -> Scalar:
-    """The force that is to be balanced, in the root of an energy; no derivative."""
+def _force_size(model: AbstractModel, guess: State) -> Scalar:
+    """The size of the forces at the guess, as the root of an energy; a constant."""
     length = largest(guess.q * model.scales.coordinate)
     size = jnp.maximum(largest(model.slope(guess) / model.scales.coordinate), length)
     return jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))

@@ -16,15 +16,15 @@ from .projection import project_position, project_velocity, rank_of_constraints
 
 
 class ConsistentStart(eqx.Module):
-    """A start that satisfies the constraints, and what had to be done for it.
+    """A start that satisfies the constraints, and how far from them it was before.
 
     - `state`: the projected `State`.
     - `accelerations`: `vdot`, shape `(nv,)`.
     - `multipliers`: `lambda`, shape `(nc,)`, of joints, driven constraints and relations
       between coordinates, in this order (energy per constraint unit).
     - `constraint_before`, `constraint_after`: residuals at position level, `(nc,)`.
-    - `rate_before`, `rate_after`: residuals of the joints at velocity level, `(nj,)`;
-      before the projection of `v`, but after that of `q`.
+    - `rate_before`, `rate_after`: residuals of the joints at velocity level, `(nj,)`,
+      before and after the projection of `v`; both at the projected `q`.
     """
 
     state: State
@@ -49,8 +49,8 @@ def initial_state(
 ) -> State:
     """The `State` nearest to `(q, v)` that satisfies the constraints.
 
-    As `consistent_start`, of which it returns the state alone: the one that is given, where
-    it satisfies them to round-off already.
+    The arguments and errors are those of `consistent_start`, of which only the state is
+    returned. A start that satisfies the constraints to round-off is returned unchanged.
     """
     known = known_q, known_v
     return _nearest(system, State(q, v), args, t, known, keep_known=True, throw=throw)
@@ -67,33 +67,33 @@ def consistent_start(
     known_v: Sequence[int] = (),
     throw: bool = True,
 ) -> ConsistentStart:
-    """Projects a start onto the constraints and solves for what is in balance there.
+    """Projects a start onto the constraints, and finds its accelerations and multipliers.
 
-    `q` moves by the smallest change in the metric of the inertia (Euclidean along
-    redundant coordinates) to `Phi(q) = 0`, then `v` by the smallest change in the inertia
-    to `dPhi/dt = 0`; accelerations and multipliers follow from the equations of motion.
-    All are differentiable with respect to `q`, `v` and `args`, so derivatives of a run
-    with respect to its start move along the constraints.
+    First `q` is moved to the nearest point with `Phi(q) = 0` in the metric of the inertia
+    (Euclidean along redundant coordinates), then `v` to the nearest with `dPhi/dt = 0`;
+    accelerations and multipliers follow from the equations of motion. All of them are
+    differentiable with respect to `q`, `v` and `args`, so derivatives of a run with
+    respect to its start are taken along the constraints.
 
     **Arguments:**
 
     - `system`: a `System`.
-    - `q`, `v`: arrays or lists, `(nq,)` and `(nv,)`, close to the constraints: close
-      enough for the linearised constraints to explain the error in `q`. (In numbers: a
-      second correction must be less than a fifth of the first.)
-    - `args`: handed to the functions of the system.
+    - `q`, `v`: arrays or lists, `(nq,)` and `(nv,)`. `q` must be so close to the
+      constraints that their linearisation explains its error: a second correction must be
+      less than a fifth of the first.
+    - `args`: passed to the functions of the system.
     - `t`: the time of the start, for `force` and `driven`.
-    - `known_q`, `known_v`: numbers of the coordinates and velocities that stay as they are
-      given; the others are solved for. Velocities may be known that follow from others.
-    - `throw`: raise an error where there is no start. With `False` it is NaN, so that one
-      lane of a batch does not end the others; a run from there fails and says so.
+    - `known_q`, `known_v`: indices of the coordinates and velocities that are kept; the
+      others are solved for. Some of the known velocities may follow from the others.
+    - `throw`: raise an error if there is no consistent start. With `False` it is NaN, so
+      that one lane of a batch does not stop the others; a run from there fails.
 
     **Returns:** a `ConsistentStart`.
 
-    **Raises:** `ValueError` for a start that is too far away, with the residual, and for
-    bad input as `simulate`. Under `jit`, `vmap` and `grad` a start too far away raises
-    `equinox.EquinoxRuntimeError` at run time. The same for constraints that are not
-    independent at the start, with their rank.
+    **Raises:** `ValueError` for a start that is too far from the constraints, with the
+    residual, and for constraints that are not independent at the start, with their rank;
+    under `jit`, `vmap` and `grad` both raise `equinox.EquinoxRuntimeError` at run time.
+    `ValueError` and `TypeError` for bad input, as `simulate`.
     """
     known = known_q, known_v
     return _start(system, State(q, v), args, t, known, keep_known=True, throw=throw)
@@ -102,7 +102,7 @@ def consistent_start(
 def start_near(
     system: AbstractSystem, state: State, args: Args, t: Real, known_v: Sequence[int]
 ) -> State:
-    """As `initial_state`, but known velocities change where joints do not admit them."""
+    """`initial_state`, except that known velocities are changed if joints forbid them."""
     return _nearest(system, state, args, t, ((), known_v), keep_known=False, throw=True)
 
 
@@ -116,12 +116,12 @@ def _nearest(
     keep_known: bool,
     throw: bool,
 ) -> State:
-    given, checked = check_system(system, state, args, t)
-    if is_known((system, given, checked)):
-        met = _is_met(system, given, checked)
-        # A small program spares the compilation of a large one.
-        if is_known(met) and met:
-            return State(given.q, given.v)
+    checked_state, checked_args = check_system(system, state, args, t)
+    if is_known((system, checked_state, checked_args)):
+        # This small program often saves the compilation of the large one.
+        is_consistent = _is_consistent(system, checked_state, checked_args)
+        if is_known(is_consistent) and is_consistent:
+            return State(checked_state.q, checked_state.v)
     return _start(system, state, args, t, known, keep_known=keep_known, throw=throw).state
 
 
@@ -136,11 +136,9 @@ def _start(
     throw: bool,
 ) -> ConsistentStart:
     state, args = check_system(system, state, args, t)
-    known = _numbers("known_q", known[0], state.q), _numbers("known_v", known[1], state.v)
+    known = _indices("known_q", known[0], state.q), _indices("known_v", known[1], state.v)
     if known[1] and not isinstance(system, System):
-        raise ValueError(
-            "`known_v`: only the velocities of a plain `System` can be given in part."
-        )
+        raise ValueError("`known_v`: only a plain `System` can have known velocities.")
     start, near, kept, rank = _project(system, state, args, known)
     if not throw:
         independent = system.redundant | (rank == start.multipliers.size)
@@ -152,7 +150,7 @@ def _start(
         "The start is too far from the constraints to be repaired: their linearisation "
         "does not explain the error, so the nearest admissible configuration may not be "
         "the one that was meant. Check it against the lengths and anchors in `args`"
-        + (", and whether what is known leaves enough to move." if any(known) else "."),
+        + (", and whether too many entries are known." if any(known) else "."),
         lambda: f"Residual of the constraints: {start.constraint_before}.",
     )
     num_constraints = start.multipliers.size
@@ -161,16 +159,16 @@ def _start(
     return _raise_unless(
         rank == num_constraints,
         start,
-        "The constraints do not determine their multipliers at the start: some repeat "
-        "each other, or do not depend on `q` there (a square of a distance?). Leave out "
-        "those that follow from the others, or declare `System(..., redundant=True)`.",
+        "The constraints do not determine their multipliers at the start: some follow from "
+        "others, or do not depend on `q` there (a square of a distance?). Leave out "
+        "those that follow from others, or declare `System(..., redundant=True)`.",
         lambda: f"Their Jacobian has rank {rank}, of {num_constraints} rows.",
     )
 
 
 @eqx.filter_jit
-def _is_met(system: AbstractSystem, state: State, args: Args) -> Flag:
-    """Whether nothing is left to do: the constraints hold to round-off, each for itself."""
+def _is_consistent(system: AbstractSystem, state: State, args: Args) -> Flag:
+    """Whether each constraint and its rate vanish to round-off."""
     model = make_model(system, state, args)
     inner = model.to_internal(state)
     q, t, scales = inner.q, inner.t, model.scales
@@ -188,7 +186,7 @@ def _is_met(system: AbstractSystem, state: State, args: Args) -> Flag:
 def _raise_unless(
     good: Flag, start: ConsistentStart, message: str, figures: Callable[[], str]
 ) -> ConsistentStart:
-    """Raises with the figures where they are known, else without and at run time."""
+    """Raises an error with the figures now, or without them at run time if traced."""
     if not is_known((good, start)):
         return eqx.error_if(start, ~good, message)
     if not good:
@@ -196,15 +194,15 @@ def _raise_unless(
     return start
 
 
-def _numbers(name: str, numbers: Sequence[int], x: Array) -> tuple[int, ...]:
-    """Checked numbers of entries of a vector."""
-    array = np.asarray(numbers)
+def _indices(name: str, indices: Sequence[int], x: Array) -> tuple[int, ...]:
+    """Checked indices of entries of `x`."""
+    array = np.asarray(indices)
     if array.size == 0:
         return ()
     bad = array.ndim != 1 or not np.issubdtype(array.dtype, np.integer)
     if bad or np.any(array < 0) or np.any(array >= x.size):
         raise ValueError(
-            f"`{name}` must be a list of numbers from 0 to {x.size - 1}, got {numbers}."
+            f"`{name}` must be a list of indices from 0 to {x.size - 1}, got {indices}."
         )
     return tuple(sorted(set(array.tolist())))
 
@@ -216,7 +214,8 @@ def _project(
     args: Args,
     known: tuple[tuple[int, ...], tuple[int, ...]],
 ) -> tuple[ConsistentStart, Flag, Flag, Count]:
-    """The start; whether it is near, and keeps known velocities; the constraints' rank."""
+    """The start, whether it is near, whether it keeps known velocities, and the rank of
+    the constraints."""
     model = make_model(system, guess, args)
     t = guess.t
     before = model.constraint(guess.q, t)

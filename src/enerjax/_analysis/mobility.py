@@ -1,4 +1,4 @@
-"""What a mechanism can do in one pose: its freedoms, and constraints that repeat others."""
+"""Degrees of freedom of a mechanism in one pose, and constraints that are redundant."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -15,25 +15,25 @@ from .._system import AbstractSystem, check_system, State
 from .._types import Args, Real
 
 
-# Relative size below which a singular value counts as zero.
+# Smaller singular values of the scaled constraints count as zero: half the digits.
 _RANK = 1e-8
-# Residual, in parts of the size of a constraint, above which it is violated.
-_MET = 1e-6
+# A constraint is violated if its residual exceeds this fraction of its size.
+_VIOLATED = 1e-6
 
 
 class Mobility(NamedTuple):
-    """The freedoms of a system in one pose; see `mobility`.
+    """The degrees of freedom of a system in one pose; see `mobility`.
 
-    - `degrees_of_freedom`: independent velocities that the constraints admit.
-    - `rank`: of the constraints; `num_constraints` if they are independent.
-    - `num_constraints`: rows, joints first.
-    - `redundant`: numbers (or names) of rows that follow from those before them.
-    - `inconsistent`: rows, redundant or not, that are violated in this pose and that no
-      small motion repairs together with the others.
-    - `singular_values`: of the constraints scaled to order one, descending. A small one
-      marks a pose close to a singular one.
-    - `velocities`: columns are independent rates of the coordinates, `(nq, dof)`,
-      orthonormal in the inertia.
+    - `degrees_of_freedom`: the number of independent velocities that are admissible.
+    - `rank`: of the constraint Jacobian.
+    - `num_constraints`: equals the rank if the constraints are independent.
+    - `redundant`: constraints that follow from those before them, by index or name.
+    - `inconsistent`: constraints, redundant or not, that are violated in this pose, and
+      that no small motion can repair together with the others.
+    - `singular_values`: of the scaled constraint Jacobian, descending. The pose is close
+      to a singular one if the smallest is small.
+    - `velocities`: independent admissible rates of the coordinates as columns, shape
+      `(nq, dof)`, orthonormal in the inertia.
     """
 
     degrees_of_freedom: int
@@ -53,7 +53,7 @@ class Mobility(NamedTuple):
         if self.redundant:
             lines.append(f"follow from others: {named(self.redundant)}")
         if self.inconsistent:
-            lines.append(f"violated, and not to be repaired: {named(self.inconsistent)}")
+            lines.append(f"violated, and cannot be repaired: {named(self.inconsistent)}")
         if self.rank:
             least = self.singular_values[self.rank - 1]
             lines.append(f"smallest singular value {least:.2g}: small near singular poses")
@@ -68,18 +68,18 @@ def mobility(
     t: Real = 0.0,
     names: Sequence[str] | None = None,
 ) -> Mobility:
-    """Counts the freedoms of a mechanism, and finds the constraints that repeat others.
+    """Counts the degrees of freedom of a mechanism, and finds redundant constraints.
 
-    By the rank of `dPhi/dq` in the metric of the inertia, so that units do not matter. In
-    a singular pose, where constraints lose their independence for an instant, it counts
-    the freedoms of that instant.
+    The count follows from the rank of `dPhi/dq` in the metric of the inertia, so that units
+    do not matter. In a singular pose, where constraints lose their independence for an
+    instant, the additional instantaneous freedoms are counted too.
 
     **Arguments:**
 
-    - `system`, `state`, `args`: as for `simulate`. The constraints need not hold. Numbers,
-      not traced values.
+    - `system`, `state`, `args`: as for `simulate`, but not traced. The constraints need
+      not hold.
     - `t`: the time, for `driven` constraints.
-    - `names`: of the rows of the constraints, joints first; their numbers by default.
+    - `names`: of the constraints, joints first; their indices by default.
 
     **Returns:** a `Mobility`.
 
@@ -96,7 +96,7 @@ def freedoms(
     names: Sequence[str] | None,
     first: Sequence[int],
 ) -> Mobility:
-    """`mobility`, with rows that stand `first`, before those that may follow from them."""
+    """`mobility`, where the rows in `first` count before all others."""
     state, args = check_system(system, state, args, t)
     scaled, root, residual = scaled_constraints(system, state, args)
     num_constraints, num_coordinates = scaled.shape
@@ -104,57 +104,58 @@ def freedoms(
         names = [str(k) for k in range(num_constraints)]
         label = lambda rows: tuple(int(k) for k in sorted(rows))
     else:
-        given = list(names)
-        if len(given) != num_constraints:
+        labels = list(names)
+        if len(labels) != num_constraints:
             raise ValueError(
-                f"`mobility(names=...)`: {len(given)} names for {num_constraints} rows "
-                "of constraints."
+                f"`mobility(names=...)`: {len(labels)} names for {num_constraints} "
+                "constraints."
             )
-        label = lambda rows: tuple(given[k] for k in sorted(rows))
+        label = lambda rows: tuple(labels[k] for k in sorted(rows))
     left, values, right = np.linalg.svd(scaled)
     rank = int(np.sum(values > _RANK))
     kept = independent_rows(scaled, first)
-    # What no motion can repair: the part of the residual outside of the range.
-    stuck = left[:, rank:] @ (left[:, rank:].T @ residual)
+    # No motion can repair the part of the residual outside of the range of the Jacobian.
+    unrepaired = left[:, rank:] @ (left[:, rank:].T @ residual)
     return Mobility(
         degrees_of_freedom=num_coordinates - rank,
         rank=rank,
         num_constraints=num_constraints,
         redundant=label(set(range(num_constraints)) - set(kept)),
-        inconsistent=label(np.nonzero(np.abs(stuck) > _MET)[0]),
+        inconsistent=label(np.nonzero(np.abs(unrepaired) > _VIOLATED)[0]),
         singular_values=values,
         velocities=scipy.linalg.solve_triangular(root.T, right[rank:].T),
     )
 
 
 def independent_rows(scaled: np.ndarray, first: Sequence[int] = ()) -> list[int]:
-    """Numbers of the rows that do not follow from those before them, `first` ahead of all.
+    """As many rows as the rank that do not follow from those before them.
 
-    As many as the rank.
+    The rows in `first` count before all others.
     """
     rank = int(np.sum(np.linalg.svd(scaled, compute_uv=False) > _RANK))
     rows = [*first, *(k for k in range(len(scaled)) if k not in set(first))]
     basis, count = np.zeros_like(scaled), 0
-    own = np.zeros(len(scaled))  # the length of what is not in the rows before
+    distance = np.zeros(len(scaled))  # of a row from the span of the rows before it
     for k in rows:
         rest, before = scaled[k], basis[:count]
-        for _ in range(2):  # once more for round-off
+        for _ in range(2):  # the second pass removes round-off
             rest = rest - (before @ rest) @ before
-        own[k] = np.linalg.norm(rest)
-        if own[k] > _RANK:
-            basis[count] = rest / own[k]
+        distance[k] = np.linalg.norm(rest)
+        if distance[k] > _RANK:
+            basis[count] = rest / distance[k]
             count += 1
-    return sorted(np.argsort(-own, kind="stable")[:rank].tolist())
+    return sorted(np.argsort(-distance, kind="stable")[:rank].tolist())
 
 
 def scaled_constraints(
     system: AbstractSystem, state: State, args: Args
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`dPhi/dq` in units of the constraints and the inertia, the root of the inertia, and
-    the residual in parts of the sizes of the constraints.
+    """The scaled constraint Jacobian, the Cholesky factor of the inertia, and the residual
+    of each constraint as a fraction of its size.
 
-    Those are of their terms, and of the change that would come of moving the pose as far
-    as it is from the origin: the terms of a constraint can vanish.
+    The rows of the Jacobian have unit length in the inverse inertia. The size of a
+    constraint is that of its terms, plus its change when the pose moves as far as the
+    origin is away: all of its terms may vanish.
     """
     metric, jacobian, residual, size = map(np.asarray, _linearised(system, state, args))
     root = np.linalg.cholesky(metric)
@@ -169,7 +170,7 @@ def scaled_constraints(
 def _linearised(
     system: AbstractSystem, state: State, args: Args
 ) -> tuple[Array, Array, Array, Array]:
-    """The inertia in the coordinates; the constraints: gradients, residuals, sizes."""
+    """The inertia in the coordinates; Jacobian, residuals and sizes of the constraints."""
     model = make_model(system, state, args)
     metric = as_dense(model.metric(model.to_internal(state)))
     jacobian = jax.jacfwd(model.constraint)(state.q, state.t)

@@ -17,16 +17,16 @@ from .equilibrium import at_rest
 from .mobility import independent_rows, scaled_constraints
 
 
-# Forces out of balance, in parts of all forces, above which a pose is no equilibrium.
-_BALANCED = 1e-6
+# A pose is no equilibrium if this fraction of the forces is out of balance.
+_UNBALANCED = 1e-6
 
 
 class Modes(eqx.Module):
     """Frequencies and shapes of small vibrations; see `modes`.
 
-    - `eigenvalues`: squares of the angular frequencies, ascending (1/time^2), negative
-      where the equilibrium is unstable.
-    - `shapes`: rows are displacements of the coordinates, shape `(modes, nq)`, orthonormal
+    - `eigenvalues`: squares of the angular frequencies, ascending (1/time^2); one is
+      negative if the equilibrium is unstable.
+    - `shapes`: displacements of the coordinates as rows, shape `(modes, nq)`, orthonormal
       in the inertia.
     """
 
@@ -35,7 +35,7 @@ class Modes(eqx.Module):
 
     @property
     def frequencies(self) -> Float[Array, " modes"]:
-        """Angular frequencies (1/time); rates of growth, with a minus, if unstable."""
+        """Angular frequencies (1/time); of an unstable mode minus its rate of growth."""
         root = jnp.sqrt(jnp.abs(self.eigenvalues))
         return jnp.where(self.eigenvalues < 0, -root, root)
 
@@ -45,23 +45,23 @@ def modes(
 ) -> Modes:
     """The modes of vibration about an equilibrium, with all constraints held.
 
-    The eigenvalues of `Hess(V + lambda . Phi)` against the inertia, on the motions that
-    the constraints admit. Differentiable, the eigenvalues where they are simple and the
-    shapes where no two eigenvalues are equal.
+    They solve the eigenvalue problem of `Hess(V + lambda . Phi)` and the inertia, within
+    the admissible displacements. Simple eigenvalues are differentiable; shapes are, if no
+    two eigenvalues are equal.
 
     **Arguments:**
 
     - `system`, `args`: as for `simulate`.
-    - `state`: an equilibrium; its velocities are taken to be zero.
-    - `t`: the time at which `driven` constraints are taken to stand still.
+    - `state`: an equilibrium; its velocities are ignored.
+    - `t`: the time at which `driven` constraints are frozen.
 
-    **Returns:** `Modes`, as many as there are coordinates less constraints. Those must be
-    independent, or the system declared with `redundant=True`; then those count that are,
-    and the pose must be known: not within `jit` and `vmap`.
+    **Returns:** `Modes`, as many as there are coordinates less independent constraints. If
+    constraints are redundant the system must be declared with `redundant=True`, and the
+    pose must be known: such a call cannot be inside `jit` and `vmap`.
 
     **Raises:** `ValueError` and `TypeError` for bad input, and for a system with a `force`,
-    whose modes need not be vibrations. Where values are known, for a pose in which forces
-    are out of balance, with their size, and for constraints that repeat each other.
+    whose modes need not be vibrations. If values are known, also for a pose in which forces
+    are out of balance, and for redundant constraints that are not declared.
     """
     if system.force is not None:
         raise ValueError(
@@ -77,40 +77,38 @@ def modes(
 
 
 def _independent(system: AbstractSystem, rest: State, args: Args) -> tuple[int, ...]:
-    """Numbers of constraints that determine the others."""
+    """Indices of constraints that are independent and determine the others."""
     rest, args = jax.lax.stop_gradient((rest, args))
     if not is_known((system, rest, args)):
         raise ValueError(
-            "How many modes a system with `redundant=True` has depends on its pose, which "
-            "is not known under `jit` and `vmap`: call `modes` outside of them, or leave "
-            "out the constraints that repeat others."
+            "The number of modes of a system with `redundant=True` depends on its pose, "
+            "which is not known under `jit` and `vmap`: call `modes` outside of them, or "
+            "leave out the redundant constraints."
         )
     return tuple(independent_rows(scaled_constraints(system, rest, args)[0]))
 
 
 class _Balance(NamedTuple):
-    """Generalised forces in a pose, `(nq,)`, that no constraint carries.
-
-    `part` is their share in all forces, beyond round-off.
-    """
+    """The generalised forces in a pose that no constraint balances, shape `(nq,)`, and
+    which fraction of all forces they are, beyond round-off."""
 
     remaining: Coordinates
-    part: Scalar
+    fraction: Scalar
 
 
 def _check_balance(balance: _Balance) -> None:
-    remaining, part = np.asarray(balance.remaining), float(balance.part)
-    if not np.isfinite(part):
+    remaining, fraction = np.asarray(balance.remaining), float(balance.fraction)
+    if not np.isfinite(fraction):
         raise ValueError(
-            "`modes`: the constraints repeat each other in this pose. Leave out those that "
-            "follow from the others, or declare `System(..., redundant=True)`."
+            "`modes`: the constraints are not independent in this pose. Leave out those "
+            "that follow from others, or declare `System(..., redundant=True)`."
         )
-    if part > _BALANCED:
+    if fraction > _UNBALANCED:
         k = int(np.argmax(np.abs(remaining)))
         raise ValueError(
             "`modes` are vibrations about an equilibrium, and in this state forces are out "
-            f"of balance: {remaining[k]:.3g} along coordinate {k}, {part:.1e} of all "
-            "forces. `equilibrium(system, state, args)` finds one near it."
+            f"of balance: {remaining[k]:.3g} along coordinate {k}, {fraction:.1e} of all "
+            "forces. `equilibrium(system, state, args)` finds an equilibrium nearby."
         )
 
 
@@ -121,35 +119,36 @@ def _modes(
     model = make_model(system, rest, args)
     q = rest.q
 
-    def held(q: Coordinates) -> Array:
+    def constraint(q: Coordinates) -> Array:
         rows = model.constraint(q, rest.t)
         return rows if kept is None else rows[np.array(kept, int)]
 
-    energy = lambda q: model.potential(State(q, rest.v))
+    potential = lambda q: model.potential(State(q, rest.v))
     root = cholesky(as_dense(model.metric(model.to_internal(rest))))
-    back = inverse(root)
-    slope, jacobian = jax.grad(energy)(q), jax.jacfwd(held)(q)
-    rows = jacobian @ back.T
+    inverse_root = inverse(root)
+    slope, jacobian = jax.grad(potential)(q), jax.jacfwd(constraint)(q)
+    rows = jacobian @ inverse_root.T
     num_constraints = rows.shape[0]
-    admitted, multipliers = jnp.eye(q.size, dtype=q.dtype), jnp.zeros((0,), q.dtype)
+    projector, multipliers = jnp.eye(q.size, dtype=q.dtype), jnp.zeros((0,), q.dtype)
     if num_constraints > 0:
-        across = inverse(rows @ rows.T) @ rows
-        admitted = admitted - rows.T @ across
-        multipliers = -across @ (back @ slope)
-    strain = lambda q: energy(q) + multipliers @ held(q)
-    stiffness = back @ jax.hessian(strain)(q) @ back.T
-    inside = admitted @ stiffness @ admitted
-    # Motions that the constraints forbid are moved beyond all others.
-    beyond = 2 * jnp.sqrt(jnp.sum(stiffness**2)) + jnp.finfo(q.dtype).tiny
-    outside = jax.lax.stop_gradient(beyond) * (jnp.eye(q.size, dtype=q.dtype) - admitted)
-    values, vectors = eigh(0.5 * (inside + inside.T) + outside)
+        pseudo_inverse = inverse(rows @ rows.T) @ rows
+        projector = projector - rows.T @ pseudo_inverse
+        multipliers = -pseudo_inverse @ (inverse_root @ slope)
+    augmented = lambda q: potential(q) + multipliers @ constraint(q)
+    stiffness = inverse_root @ jax.hessian(augmented)(q) @ inverse_root.T
+    norm = jnp.sqrt(jnp.sum(stiffness**2))
+    admissible = projector @ stiffness @ projector
+    # Displacements that the constraints forbid get eigenvalues above all others.
+    above_all = jax.lax.stop_gradient(2 * norm + jnp.finfo(q.dtype).tiny)
+    forbidden = above_all * (jnp.eye(q.size, dtype=q.dtype) - projector)
+    values, vectors = eigh(0.5 * (admissible + admissible.T) + forbidden)
     order = jnp.argsort(values)[: q.size - num_constraints]
-    found = Modes(values[order], (back.T @ vectors[:, order]).T)
-    # Round-off is that of a stiff pose, `stiffness q`.
+    found = Modes(values[order], (inverse_root.T @ vectors[:, order]).T)
     length = lambda x: jnp.sqrt(x @ x)
     remaining = slope + multipliers @ jacobian
-    rounding = jnp.finfo(q.dtype).eps * jnp.sqrt(jnp.sum(stiffness**2)) * length(root.T @ q)
-    beyond = jnp.maximum(length(back @ remaining) - 1e3 * rounding, 0)
-    size = length(back @ slope)
-    part = jnp.where(beyond == 0, 0, beyond / jnp.where(size > 0, size, 1))
-    return found, jax.lax.stop_gradient(_Balance(remaining, part))
+    # The forces of stiff springs carry the round-off of the coordinates.
+    rounding = jnp.finfo(q.dtype).eps * norm * length(root.T @ q)
+    unbalanced = jnp.maximum(length(inverse_root @ remaining) - 1e3 * rounding, 0)
+    size = length(inverse_root @ slope)
+    fraction = jnp.where(unbalanced == 0, 0, unbalanced / jnp.where(size > 0, size, 1))
+    return found, jax.lax.stop_gradient(_Balance(remaining, fraction))

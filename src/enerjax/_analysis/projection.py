@@ -1,6 +1,7 @@
 """The nearest positions and velocities that satisfy the constraints.
 
-Functions whose pattern is sought make their transposes inside: there indices are known.
+Functions whose sparsity pattern is sought call `jax.vjp` inside: the indices that they use
+are then known when the pattern is found.
 """
 
 from collections.abc import Callable
@@ -17,14 +18,15 @@ from .._system import HamiltonianSystem, State
 from .._types import Coordinates, Count, Flag, Multipliers, Velocities
 
 
-Rows: TypeAlias = Callable[[Velocities], Array]
+# Functions of the velocities that must vanish.
+Conditions: TypeAlias = Callable[[Velocities], Array]
 
-# Coordinates from which the rank of the constraints is not counted.
+# With more coordinates than this a singular value decomposition takes too long.
 _LARGE = 500
 
 
 def rank_of_constraints(model: AbstractModel, state: State) -> Count:
-    """The rank of the Jacobian of the constraints; of a large one, full or less."""
+    """The rank of the constraint Jacobian; of a large one, only whether it is full."""
     q, scales = state.q, model.scales
     constraint = lambda q: model.constraint(q, state.t)
     num_constraints = scales.constraint.size
@@ -35,7 +37,7 @@ def rank_of_constraints(model: AbstractModel, state: State) -> Count:
         unit = jacobian / scales.coordinate[None, :] / scales.constraint[:, None]
         return jnp.linalg.matrix_rank(unit)
 
-    # A vector is found again from its product with `B B^T` only if that is regular.
+    # A solve recovers a vector from its product with `B B^T` only if that is regular.
     def product(mu: Multipliers) -> Multipliers:
         _, transpose = jax.vjp(constraint, q)
         motion = transpose(mu / scales.constraint)[0] / scales.coordinate**2
@@ -43,29 +45,29 @@ def rank_of_constraints(model: AbstractModel, state: State) -> Count:
 
     probe = jnp.cos(jnp.arange(num_constraints, dtype=q.dtype))
     image = product(probe)
-    again = affine_root(lambda mu: product(mu) - image, probe)
-    found = largest(again - probe) <= jnp.finfo(q.dtype).eps ** 0.25
-    return num_constraints - 1 + found.astype(int)
+    recovered = affine_root(lambda mu: product(mu) - image, probe)
+    is_full = largest(recovered - probe) <= jnp.finfo(q.dtype).eps ** 0.25
+    return num_constraints - 1 + is_full.astype(int)
 
 
-class _Held(eqx.Module):
-    """What a position must satisfy, with its scales: constraints and known entries."""
+class _Conditions(eqx.Module):
+    """The conditions on a position: the constraints, and the entries that are known."""
 
     model: AbstractModel
-    given: Coordinates
+    guess: Coordinates
     t: Time
     known: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, q: Coordinates) -> Array:
         known = jnp.asarray(self.known, int)
         constraint = self.model.constraint(q, self.t)
-        return jnp.concatenate([constraint, (q - self.given)[known]])
+        return jnp.concatenate([constraint, (q - self.guess)[known]])
 
     def scales(self) -> tuple[Array, Array]:
-        """As `constraint` and `constraint_size` of `Scales`."""
+        """The counterparts of `constraint` and `constraint_size` of `Scales`."""
         scales, known = self.model.scales, jnp.asarray(self.known, int)
         unit = jnp.concatenate([scales.constraint, 1 / scales.coordinate[known]])
-        return unit, jnp.concatenate([scales.constraint_size, jnp.abs(self.given[known])])
+        return unit, jnp.concatenate([scales.constraint_size, jnp.abs(self.guess[known])])
 
 
 def project_position(
@@ -78,58 +80,61 @@ def project_position(
     metric, coordinate = model.metric(model.to_internal(state)), model.scales.coordinate
     size = largest(guess * coordinate)
     size = jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
-    held = _Held(model, guess, state.t, known)
+    conditions = _Conditions(model, guess, state.t, known)
 
-    def conditions(x, inputs):
-        """The nearest point: `metric (q - guess) + B^T mu = 0`, `Phi(q) = 0`."""
-        held, metric, size = inputs
-        coordinate, (unit, rounding) = held.model.scales.coordinate, held.scales()
+    def nearest(x, inputs):
+        """`metric (q - guess) + B^T mu = 0`, `Phi(q) = 0`."""
+        conditions, metric, size = inputs
+        coordinate = conditions.model.scales.coordinate
+        unit, rounding = conditions.scales()
         shift, mu = size * x[0] / coordinate, size * x[1] / unit
-        constraint, pull = jax.vjp(held, held.given + shift)
-        force = metric @ shift + pull(mu)[0]
+        constraint, transpose = jax.vjp(conditions, conditions.guess + shift)
+        force = metric @ shift + transpose(mu)[0]
         return force / (size * coordinate), constraint / (size * unit + rounding)
 
-    inputs = (held, metric, size)
-    zero = (jnp.zeros_like(guess), jnp.zeros_like(held.scales()[0]))
+    inputs = (conditions, metric, size)
+    zero = (jnp.zeros_like(guess), jnp.zeros_like(conditions.scales()[0]))
     tolerance = 1e2 * jnp.finfo(guess.dtype).eps
     regularisation = model.regularisation(zero[1].size, guess.dtype)
     regularisation = None if regularisation is None else (zero[0], regularisation)
     root = find_root(
-        conditions, Newton(), zero, inputs, max_iterations=50, regularisation=regularisation
+        nearest, Newton(), zero, inputs, max_iterations=50, regularisation=regularisation
     )
     x, found = root.value, root.found
-    # Constraints that are met are not far; whether they are independent is told apart.
-    met = largest(conditions(zero, inputs)[1]) <= tolerance
-    near = met | (found & _linear(held, metric))
-    q = jnp.where(met & ~found, guess, guess + size * x[0] / coordinate)
+    # A guess that satisfies dependent constraints is near, though Newton's method fails;
+    # their rank is checked elsewhere.
+    is_satisfied = largest(nearest(zero, inputs)[1]) <= tolerance
+    near = is_satisfied | (found & _explains_error(conditions, metric))
+    q = jnp.where(is_satisfied & ~found, guess, guess + size * x[0] / coordinate)
     return q, near
 
 
-def _linear(held: _Held, metric: Symmetric) -> Flag:
+def _explains_error(conditions: _Conditions, metric: Symmetric) -> Flag:
     """Whether the linearised constraints explain the error of a state.
 
     The natural monotonicity test of P. Deuflhard, Newton Methods for Nonlinear Problems
-    (2004): a simplified second correction shorter than a fifth of the first. (From
-    infinitely far from a sphere it is a quarter.)
+    (2004): a simplified second correction must be shorter than a fifth of the first. (From
+    a point infinitely far from a sphere it is a quarter.)
     """
-    q, (unit, _), coordinate = held.given, held.scales(), held.model.scales.coordinate
+    model, q, (unit, _) = conditions.model, conditions.guess, conditions.scales()
+    coordinate = model.scales.coordinate
 
     def correction(residual: Multipliers) -> Coordinates:
-        """The shortest with this effect on the constraints."""
+        """The shortest one that changes the conditions by `residual`."""
 
-        def conditions(x: Array) -> Array:
+        def linearised(x: Array) -> Array:
             shift, mu = x[: q.size] / coordinate, x[q.size :] / unit
-            _, transpose = jax.vjp(held, q)
-            change = jax.jvp(held, (q,), (shift,))[1] - residual
+            _, transpose = jax.vjp(conditions, q)
+            change = jax.jvp(conditions, (q,), (shift,))[1] - residual
             force = metric @ shift + transpose(mu)[0]
             return jnp.concatenate([force / coordinate, change / unit])
 
         like = jnp.zeros((q.size + residual.size,), q.dtype)
-        x = affine_root(conditions, like, held.model.regularisation_after(q, unit.size))
+        x = affine_root(linearised, like, model.regularisation_after(q, unit.size))
         return x[: q.size] / coordinate
 
-    first = correction(held(q))
-    second = correction(held(q - first))
+    first = correction(conditions(q))
+    second = correction(conditions(q - first))
     length = lambda x: jnp.sqrt(x @ metric @ x)
     return length(second) <= 0.2 * length(first)
 
@@ -137,8 +142,8 @@ def _linear(held: _Held, metric: Symmetric) -> Flag:
 def project_velocity(
     model: AbstractModel, state: State, known: tuple[int, ...]
 ) -> tuple[Velocities, Flag]:
-    """The nearest velocities (or momenta) that the joints admit, and whether the known
-    entries are among them as they were given."""
+    """The nearest velocities (or momenta) that the joints admit, and whether these keep
+    the known entries."""
     q, v, t = state.q, state.v, state.t
     if model.joint(q, t).size == 0:
         return v, jnp.array(True)
@@ -147,30 +152,31 @@ def project_velocity(
     rates = lambda x: model.joint_rate(q, x, t)
 
     def correct(
-        v: Velocities, held: Rows, unit: Array, regularisation: Array | None
+        v: Velocities, conditions: Conditions, unit: Array, regularisation: Array | None
     ) -> Velocities:
         inverse_metric = model.inverse_metric(State(q, v))
-        rate = held(v)
+        rate = conditions(v)
 
         def change(mu: Array) -> Velocities:
-            _, transpose = jax.vjp(held, v)
+            _, transpose = jax.vjp(conditions, v)
             return inverse_metric @ transpose(mu / unit)[0]
 
-        remaining = lambda mu: (rate - jax.jvp(held, (v,), (change(mu),))[1]) / unit
+        remaining = lambda mu: (rate - jax.jvp(conditions, (v,), (change(mu),))[1]) / unit
         return v - change(affine_root(remaining, rate, regularisation))
 
     end, root = v, jnp.sqrt(model.inverse_metric(state).diagonal())
     if known:
-        # What is known may follow from the joints too: their rows need not be independent.
-        numbers = jnp.asarray(known, int)
-        both = lambda x: jnp.concatenate([rates(x), (x - v)[numbers]])
-        units = jnp.concatenate([unit, root[numbers]])
+        # Known velocities may follow from the joints, so the rows may be dependent.
+        indices = jnp.asarray(known, int)
+        both = lambda x: jnp.concatenate([rates(x), (x - v)[indices]])
+        units = jnp.concatenate([unit, root[indices]])
         regularisation = jnp.full_like(units, -(eps**0.5))
-        # The regularisation changes what the first correction does. Each further one takes
-        # back most of that: in a nearly singular pose two would leave an error of 1e-11.
+        # Each correction after the first removes most of the error of the regularisation.
+        # In a nearly singular pose two corrections leave 1e-11, four leave round-off.
         toward = lambda end, _: (correct(end, both, units, regularisation), None)
         end = jax.lax.scan(toward, end, None, length=4)[0]
-    # Exact at once where the energy is a quadratic form of the momenta; else Newton.
+    # One correction is exact if the energy is a quadratic form of the momenta. Otherwise
+    # the corrections are iterations of Newton's method, which converge quadratically.
     corrections = 8 if isinstance(model.system, HamiltonianSystem) else 1
     regularisation = model.regularisation(unit.size, v.dtype)
     again = lambda v, _: (correct(v, rates, unit, regularisation), None)
