@@ -11,37 +11,54 @@ from jaxtyping import Array
 
 from .._programs import evaluate, is_known
 from . import elementary
-from .transform import at_a, at_b, increment, moves, Moving, NoRule, Rule, Switching, Value
+from .transform import (
+    at_a,
+    at_b,
+    increment,
+    moves,
+    Moving,
+    NoRule,
+    refuse_choices,
+    Rule,
+    Switching,
+    Value,
+)
+
+
+# Both write the operation out, and bound the size of the program: an extreme over more
+# entries than this goes to the fallback, a power with twice this exponent through `exp`.
+_LONGEST_CHAIN = 64
+_LARGEST_EXPONENT = 64
+
+
+def apply(operands: list[Array], params: dict[str, Any]) -> list[Array]:
+    """The outputs of the primitive that a rule is called for."""
+    own = {key: x for key, x in params.items() if key not in ("walk", "primitive")}
+    return evaluate(params["primitive"], operands, own)
 
 
 def both(values: list[Value], params: dict[str, Any]) -> list[tuple[Array, Array]]:
     """The outputs of a primitive at `a` and at `b`."""
-    params = dict(params)
-    primitive = params.pop("primitive")
-    params.pop("walk")
-    ends = [evaluate(primitive, list(map(at, values)), params) for at in (at_a, at_b)]
+    ends = [apply(list(map(at, values)), params) for at in (at_a, at_b)]
     return list(zip(*ends, strict=True))
 
 
 def linear(*positions: int) -> Rule:
-    """Linear in the operands at `positions` together (in all, if none is named)."""
+    """A primitive that is linear in the operands at `positions` together (default: all)."""
 
     def rule(values: list[Value], params: dict[str, Any]) -> list[Value]:
         linear = positions or range(len(values))
         if any(moves(v) for k, v in enumerate(values) if k not in linear):
             raise NoRule
-        params = dict(params)
-        primitive = params.pop("primitive")
-        params.pop("walk")
 
         def push(part: Callable[[Value], Array]) -> list[Array]:
             chosen = [part(v) if k in linear else v for k, v in enumerate(values)]
-            return evaluate(primitive, chosen, params)
+            return apply(chosen, params)
 
         ends = push(at_a), push(at_b)
         if not any(isinstance(v, Switching) for v in values):
             return list(map(Moving, *ends, push(increment)))
-        # Choices that are only moved about take along what decided them.
+        # A choice that is only moved to another place keeps what decided it.
         zero = lambda v: jnp.zeros(jnp.shape(v))
         squares = push(lambda v: v.squares if isinstance(v, Switching) else zero(v))
         decided = push(lambda v: v.decided if isinstance(v, Switching) else zero(v))
@@ -67,8 +84,7 @@ def rewritten(function: Callable[..., Array]) -> Rule:
     """A function that is a composition of others with rules."""
 
     def rule(values: list[Value], params: dict[str, Any]) -> list[Value]:
-        if any(isinstance(v, Switching) for v in values):
-            raise NoRule
+        refuse_choices(values)
         program = jax.make_jaxpr(function)(*map(at_a, values))
         (out,) = params["walk"].closed(program, values)
         ((a, b),) = both(values, params)
@@ -79,12 +95,8 @@ def rewritten(function: Callable[..., Array]) -> Rule:
 
 def product(values: list[Value], params: dict[str, Any]) -> list[Value]:
     """Any bilinear operation: `mul` and `dot_general`."""
-    if any(isinstance(v, Switching) for v in values):
-        raise NoRule
-    params = dict(params)
-    primitive = params.pop("primitive")
-    params.pop("walk")
-    product = lambda x, y: evaluate(primitive, [x, y], params)[0]
+    refuse_choices(values)
+    product = lambda x, y: apply([x, y], params)[0]
     u, v = values
     a, b = product(at_a(u), at_a(v)), product(at_b(u), at_b(v))
     terms = []
@@ -100,8 +112,7 @@ def _mean(value: Value) -> Array:
 
 
 def div(values: list[Value], params: dict[str, Any]) -> list[Value]:
-    if any(isinstance(v, Switching) for v in values):
-        raise NoRule
+    refuse_choices(values)
     ((a, b),) = both(values, params)
     u, v = values
     if not moves(v):
@@ -117,14 +128,13 @@ def integer_pow(values: list[Value], params: dict[str, Any]) -> list[Value]:
 
 def power(values: list[Value], params: dict[str, Any]) -> list[Value]:
     x, y = values
-    if any(isinstance(v, Switching) for v in values):
-        raise NoRule
+    refuse_choices(values)
     if moves(y):
         return _moving_exponent(values, params)
     quotient = lambda a, b: elementary.pow(a, b, jnp.asarray(y, a.dtype))
     if jnp.ndim(y) == 0 and is_known(y):
         twice = 2 * float(y)
-        if twice.is_integer() and abs(twice) <= 64:
+        if twice.is_integer() and abs(twice) <= _LARGEST_EXPONENT:
             n = int(twice)
             quotient = lambda a, b: (
                 elementary.integer_pow(a, b, n // 2)
@@ -136,7 +146,7 @@ def power(values: list[Value], params: dict[str, Any]) -> list[Value]:
 
 
 def _moving_exponent(values: list[Value], params: dict[str, Any]) -> list[Value]:
-    """`exp(y log x)`, with the values of the power itself: they have more digits."""
+    """`exp(y log x)`; its values are those of the power itself, which are more accurate."""
     x, y = values
     ((a, b),) = both(values, params)
     (xa, ya), (xb, yb) = map(at_a, values), map(at_b, values)
@@ -155,27 +165,26 @@ def absolute(values: list[Value], params: dict[str, Any]) -> list[Value]:
 
 
 def extreme(sign: int) -> Rule:
-    """`max` (sign 1) and `min` (sign -1): the mean, and half the difference's `abs`."""
+    """`max` (sign 1) and `min` (sign -1), as `(x + y + sign |x - y|) / 2`."""
 
     def rule(values: list[Value], params: dict[str, Any]) -> list[Value]:
-        if any(isinstance(v, Switching) for v in values):
-            raise NoRule
+        refuse_choices(values)
         ((a, b),) = both(values, params)
         x, y = values
-        lead = elementary.absolute(at_a(x) - at_a(y), at_b(x) - at_b(y))
+        quotient = elementary.absolute(at_a(x) - at_a(y), at_b(x) - at_b(y))
         dx, dy = increment(x), increment(y)
-        return [Moving(a, b, 0.5 * (dx + dy) + 0.5 * sign * lead * (dx - dy))]
+        return [Moving(a, b, 0.5 * (dx + dy) + 0.5 * sign * quotient * (dx - dy))]
 
     return rule
 
 
 def reduce_extreme(pair: Callable[[Array, Array], Array]) -> Rule:
-    """Over the entries of short axes in pairs."""
+    """The extreme over short axes, as a chain of extremes of pairs."""
 
     def rule(values: list[Value], params: dict[str, Any]) -> list[Value]:
         (x,) = values
         axes = params["axes"]
-        if math.prod(x.a.shape[k] for k in axes) > 64:
+        if math.prod(x.a.shape[k] for k in axes) > _LONGEST_CHAIN:
             raise NoRule
 
         def reduce(v: Array) -> Array:
@@ -189,7 +198,8 @@ def reduce_extreme(pair: Callable[[Array, Array], Array]) -> Rule:
 
 
 def reduce_prod(values: list[Value], params: dict[str, Any]) -> list[Value]:
-    """Factor by factor: with `b` before the factor and `a` after it, and the other way."""
+    """The telescoping product: factors before the one that changes are those of `b`, and
+    factors after it those of `a`; then averaged with the opposite order."""
     (x,) = values
     ((a, b),) = both(values, params)
     kept = [k for k in range(x.a.ndim) if k not in params["axes"]]

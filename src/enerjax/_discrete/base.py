@@ -10,7 +10,7 @@ from .._types import Coordinates, Scalar
 
 
 class AbstractDerivative(eqx.Module):
-    """A discrete gradient: a rule that turns a function and two points into a vector.
+    """A discrete gradient: it maps a function and two points to a vector.
 
     Every form satisfies, with `D = gradient(fn, a, b)`,
 
@@ -20,9 +20,9 @@ class AbstractDerivative(eqx.Module):
     is symmetric in `a` and `b`, and linear in `fn`: the discrete gradient of
     `V + lam . Phi` is that of `V` plus those of the constraints, row by row.
 
-    Schemes try the first two at the start of a run, with the functions of the system. A
-    form that is not directional must say so, `is_directional = False` in the class: the
-    energy is then not kept, and the audit of a run shows by how much.
+    The first two are checked at the start of a run, with the functions of the system. A
+    form that is not directional must set `is_directional = False` in its class. The energy
+    is then not conserved, and the audit of a run shows by how much.
     """
 
     is_directional: ClassVar[bool] = True
@@ -39,16 +39,15 @@ class AbstractDerivative(eqx.Module):
     ) -> Coordinates:
         """The discrete gradient of the scalar function `fn` between `a` and `b`.
 
-        `weights` are what squares of the increments are weighted with in the norm of a
-        correction: they matter where the entries have different units. `size` tells how
-        large the terms of `fn` are, where they may cancel: a correction below their
-        round-off is none.
+        `weights` are those of the squared increments in the norm of a correction; they
+        matter if the entries have different units. `size` is that of the terms of `fn`,
+        which may cancel: a correction below their round-off is dropped.
         """
 
 
 def significant(defect: Array, size: Array) -> Array:
-    """`defect`, or zero where it is the round-off of a difference of numbers of `size`.
+    """`defect`, or zero if it is the round-off of a difference of numbers of `size`.
 
-    Not a number stays what it is: it must show in the step.
+    NaN stays NaN, so that the step fails.
     """
     return jnp.where(jnp.abs(defect) <= jnp.finfo(defect.dtype).eps * size, 0, defect)

@@ -1,4 +1,4 @@
-"""The public transformations, shaped like JAX's own."""
+"""Discrete derivatives by the chain rule, with the signatures of JAX's transformations."""
 
 from collections.abc import Callable
 from typing import Any
@@ -42,9 +42,8 @@ def discrete_grad(fn: Callable[..., Scalar]) -> Callable[..., PyTree[Array]]:
     """The discrete gradient of a scalar function, as a function of two points.
 
     `discrete_grad(fn)(a, b, *args)` is a pytree `D` like `a` with
-    `D . (b - a) = fn(b) - fn(a)` to round-off and `D = grad fn(a)` at `b = a`. Where `fn`
-    is a function of invariants of linear functions of its argument (distances of points),
-    `D` keeps the symmetry.
+    `D . (b - a) = fn(b) - fn(a)` to round-off and `D = grad fn(a)` at `b = a`. If `fn` is
+    written in terms of invariants, such as distances of points, `D` keeps the symmetry.
 
     **Reference:** discrete gradients: O. Gonzalez (1996); by the chain rule for difference
     quotients, this library.
@@ -80,10 +79,10 @@ def discrete_jacobian(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[
 def discrete_fallbacks(fn: Callable[..., PyTree[Array]]) -> Callable[..., list[str]]:
     """The primitives of `fn` that have no rule, as a function of two points.
 
-    For each of them the discrete derivative is that of the corrected mean value, of that
-    primitive alone. So it is for functions with a derivative of their own
-    (`jax.custom_jvp`, `jax.custom_vjp`), which are listed with their names: the derivative
-    that was given is used, and not that of the program inside. Empty where all is exact.
+    The discrete derivative of such a primitive is its corrected mean derivative. The list
+    also names the functions that define their own derivative (`jax.custom_jvp`,
+    `jax.custom_vjp`): that derivative is used, and not the one of the program inside. The
+    list is empty if the chain rule holds for all of `fn`.
     """
 
     def fallbacks(a: PyTree[Array], b: PyTree[Array], *args: Any) -> list[str]:
@@ -98,19 +97,19 @@ def discrete_fallbacks(fn: Callable[..., PyTree[Array]]) -> Callable[..., list[s
 def _traced(
     fn: Callable, a: PyTree[Array], b: PyTree[Array], args: tuple
 ) -> Callable[[PyTree[Array], Walk], PyTree[Array]]:
-    """The increment of the output for one of the input, by a walk."""
+    """A function that maps an increment of the input to that of the output."""
     a, b = (jax.tree.map(jnp.asarray, x) for x in (a, b))
     flat_a, structure = jax.tree.flatten(a)
     flat_b, structure_b = jax.tree.flatten(b)
-    kinds = [[(x.shape, x.dtype) for x in flat] for flat in (flat_a, flat_b)]
-    if structure != structure_b or kinds[0] != kinds[1]:
-        raise TypeError(f"The two points must be alike, got {kinds[0]} and {kinds[1]}.")
+    types = [[(x.shape, x.dtype) for x in flat] for flat in (flat_a, flat_b)]
+    if structure != structure_b or types[0] != types[1]:
+        raise TypeError(f"The two points must be alike, got {types[0]} and {types[1]}.")
     if not all(jnp.issubdtype(x.dtype, jnp.floating) for x in flat_a):
-        raise TypeError(f"The two points must be real arrays, got {kinds[0]}.")
+        raise TypeError(f"The two points must be real arrays, got {types[0]}.")
     program, shape = jax.make_jaxpr(lambda x: fn(x, *args), return_shape=True)(a)
-    kinds = [x.dtype for x in jax.tree.leaves(shape)]
-    if not all(jnp.issubdtype(kind, jnp.floating) for kind in kinds):
-        raise TypeError(f"The function must return real arrays, got {kinds}.")
+    dtypes = [x.dtype for x in jax.tree.leaves(shape)]
+    if not all(jnp.issubdtype(dtype, jnp.floating) for dtype in dtypes):
+        raise TypeError(f"The function must return real arrays, got {dtypes}.")
     out_structure = jax.tree.structure(shape)
 
     def push(d: PyTree[Array], walk: Walk) -> PyTree[Array]:
@@ -122,10 +121,10 @@ def _traced(
 
 
 def _valid_increment(value: Value) -> Array:
-    """The increment of an output, which is no number where the function has no value.
+    """The increment of an output; NaN if the output is not finite at one of the points.
 
-    Difference quotients can be finite where the function itself is not defined: that of a
-    logarithm between negative numbers, say.
+    A difference quotient can be finite where the function is not defined, such as that of
+    a logarithm between two negative numbers.
     """
     if not isinstance(value, Moving):
         return increment(value)
@@ -136,8 +135,8 @@ def _valid_increment(value: Value) -> Array:
 class ChainRule(AbstractDerivative):
     """Discrete differentiation by the chain rule: exact without a correction.
 
-    See `discrete_grad`. The discrete derivative inherits the symmetries that the function
-    shows, so schemes that use it conserve momenta as well as energy; second-order accurate.
+    See `discrete_grad`. The discrete gradient inherits the symmetries of the program, so
+    schemes that use it conserve momenta as well as energy. Second-order accurate.
     """
 
     def gradient(

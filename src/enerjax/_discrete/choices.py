@@ -1,4 +1,4 @@
-"""Rules of what chooses: comparisons, logic, selections, and the cut of an angle."""
+"""Rules of choices: comparisons, logic, selections, and the branch cut of an angle."""
 
 from typing import Any
 
@@ -8,12 +8,21 @@ from jaxtyping import Array
 
 from . import elementary
 from .arithmetic import both, linear
-from .transform import at_a, at_b, increment, Moving, NoRule, Switching, Value
+from .transform import (
+    at_a,
+    at_b,
+    increment,
+    Moving,
+    NoRule,
+    refuse_choices,
+    Switching,
+    Value,
+)
 
 
 def share(change: Array, squares: Array, decided: Array) -> Array:
-    """`change`, as a linear function of the increments of what decided it."""
-    # Where nothing moves a change is round-off, and none of it is anyone's.
+    """`change`, as a linear function of the increments of the numbers that decided it."""
+    # If none of these has moved the change is round-off, and is attributed to none.
     happens = (change != 0) & (squares != 0)
     weight = jnp.where(happens, change.astype(float) / jnp.where(happens, squares, 1), 0)
     return (weight * decided).astype(change.dtype)
@@ -35,7 +44,7 @@ def compare(values: list[Value], params: dict[str, Any]) -> list[Value]:
 
 
 def piecewise_constant(values: list[Value], params: dict[str, Any]) -> list[Value]:
-    """`floor` and its like: no increment, or the true quotient across a step."""
+    """`floor` and similar functions: zero, or the difference quotient across a step."""
     (x,) = values
     if not isinstance(x, Moving):
         raise NoRule
@@ -45,7 +54,7 @@ def piecewise_constant(values: list[Value], params: dict[str, Any]) -> list[Valu
 
 
 def sum_entries(values: list[Value], params: dict[str, Any]) -> list[Value]:
-    """Entry by entry: a sum of choices is decided by all of them."""
+    """Sums. A sum of choices is a choice that all of them decide."""
     choices = any(isinstance(v, Switching) for v in values)
     return compare(values, params) if choices else linear()(values, params)
 
@@ -63,11 +72,9 @@ def convert(values: list[Value], params: dict[str, Any]) -> list[Value]:
 def select(values: list[Value], params: dict[str, Any]) -> list[Value]:
     which, *cases = values
     if not isinstance(which, Switching):
-        if any(isinstance(v, Switching) for v in cases):
-            raise NoRule
+        refuse_choices(cases)
         return linear(*range(1, len(values)))(values, params)
-    if any(isinstance(v, Switching) for v in cases):
-        raise NoRule
+    refuse_choices(cases)
     ((a, b),) = both(values, params)
     if not jnp.issubdtype(a.dtype, jnp.inexact):
         raise NoRule
@@ -76,8 +83,8 @@ def select(values: list[Value], params: dict[str, Any]) -> list[Value]:
     mean = sum(increments[1:], increments[0]) / len(cases)
     explained = sum((at_b(v) - at_a(v) for v in cases), jnp.zeros_like(a)) / len(cases)
     same = which.a == which.b
-    # The cases explain the change in part, unless one of them is a dummy that guards a
-    # singularity of the other: then they say nothing of it.
+    # The cases explain part of the change, unless one of them is a dummy value that avoids
+    # a singularity of the other.
     rest = b - a - explained
     helps = jnp.abs(rest) <= jnp.abs(b - a)
     rest = jnp.where(same, 0, jnp.where(helps, rest, b - a))
@@ -93,18 +100,17 @@ def reduce_logic(values: list[Value], params: dict[str, Any]) -> list[Value]:
 
 
 def atan2(values: list[Value], params: dict[str, Any]) -> list[Value]:
-    if any(isinstance(v, Switching) for v in values):
-        raise NoRule
+    refuse_choices(values)
     ((a, b),) = both(values, params)
     (ya, xa), (yb, xb) = map(at_a, values), map(at_b, values)
     dy, dx = map(increment, values)
     cross, dot = xa * yb - ya * xb, xa * xb + ya * yb
     mean_x, mean_y = 0.5 * (xa + xb), 0.5 * (ya + yb)
-    # Straight across the origin there is no angle that was turned.
+    # A segment through the origin does not turn by any particular angle.
     across = (cross == 0) & (dot < 0)
     ratio = elementary.angle_ratio(cross, jnp.where(across, 1, dot))
     turned = jnp.where(across, 0, ratio * (mean_x * dy - mean_y * dx))
-    # Across the branch cut the value jumps by a whole turn that no rotation explains.
+    # Across the branch cut the value jumps by a whole turn, which no rotation explains.
     cut = jnp.round((b - a - jnp.arctan2(cross, dot)) / (2 * jnp.pi)) * (2 * jnp.pi)
     cut = jnp.where(across, b - a, cut)
     squares = ((yb - ya) ** 2 + (xb - xa) ** 2).astype(float)

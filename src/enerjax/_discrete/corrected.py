@@ -6,16 +6,16 @@ directionality exact:
 
     c = (fn(b) - fn(a) - g . d) / (d . W d)
 
-The bracket is a difference of nearly equal numbers: it carries an error of round-off
-size however small `d` is, and the division would amplify it. Below that size it holds
-no digit, so it is dropped; the directionality then fails by no more than the round-off
-of `fn` itself,
+The numerator is a difference of nearly equal numbers: it has an error of the size of
+round-off however small `d` is, which the division would amplify. Below that size no digit
+of it is right, so it is dropped. The directionality then fails by no more than the
+round-off of `fn` itself,
 
     |D . d - (fn(b) - fn(a))| <= eps (|fn(a)| + |fn(b)| + sum_k |g_k| (|a_k| + |b_k|)),
 
-(or by that of its terms, where their size is given: they can cancel), and the value and
-all its derivatives stay finite down to `b = a`. For functions that are at most quadratic
-the bracket is nothing but round-off at any `d`.
+(or by that of its terms, if their size is passed: they can cancel), and the value and all
+its derivatives stay finite down to `b = a`. For functions that are at most quadratic the
+numerator is round-off at any `d`.
 """
 
 import abc
@@ -31,7 +31,7 @@ from .._types import Coordinates, Scalar
 from .base import AbstractDerivative, significant
 
 
-def _closed(
+def _corrected(
     fn_a: Scalar,
     fn_b: Scalar,
     a: Coordinates,
@@ -43,10 +43,10 @@ def _closed(
     d = b - a
     along = weights * d
     defect = fn_b - fn_a - mean @ d
-    own = abs(fn_a) + abs(fn_b) + abs(mean) @ (abs(a) + abs(b))
-    defect = significant(defect, size + own)
-    # Both operands of the quotient are guarded: under autodiff the branch that `where`
-    # does not take is multiplied by zero, and must be finite for that.
+    terms = abs(fn_a) + abs(fn_b) + abs(mean) @ (abs(a) + abs(b))
+    defect = significant(defect, size + terms)
+    # The derivative of `where` multiplies the branch that is not chosen by zero, so this
+    # must be finite too.
     length2 = d @ along
     length2 = jnp.where((defect != 0) & (length2 != 0), length2, 1.0)
     return mean + defect / length2 * along
@@ -57,7 +57,7 @@ class AbstractCorrected(AbstractDerivative):
 
     @abc.abstractmethod
     def _quadrature(self) -> Iterable[tuple[float, float]]:
-        """Nodes in [-1, 1], and what they contribute, 1 in all."""
+        """Nodes in [-1, 1] and their weights, whose sum is 1."""
 
     def _mean(
         self, fn: Callable[[Coordinates], Array], a: Coordinates, b: Coordinates
@@ -66,8 +66,8 @@ class AbstractCorrected(AbstractDerivative):
         # Unrolled: a batched gradient hides the structure of `fn` from XLA.
         return jnp.asarray(
             sum(
-                jnp.asarray(share, a.dtype) * fn(mid + jnp.asarray(x, a.dtype) * half)
-                for x, share in self._quadrature()
+                jnp.asarray(weight, a.dtype) * fn(mid + jnp.asarray(x, a.dtype) * half)
+                for x, weight in self._quadrature()
             )
         )
 
@@ -81,31 +81,31 @@ class AbstractCorrected(AbstractDerivative):
         size: Scalar | float = 0.0,
     ) -> Coordinates:
         mean = self._mean(jax.grad(fn), a, b)
-        return _closed(fn(a), fn(b), a, b, mean, weights, size)
+        return _corrected(fn(a), fn(b), a, b, mean, weights, size)
 
     def gradients_of_rows(
         self,
         fn: Callable[[Coordinates], Float[Array, " rows"]],
         gradients: Callable[[Coordinates], Float[Array, "rows width"]],
-        own: Callable[[Coordinates], Float[Array, "rows width"]],
+        select: Callable[[Coordinates], Float[Array, "rows width"]],
         a: Coordinates,
         b: Coordinates,
     ) -> Float[Array, "rows width"]:
         """The discrete gradient of each row of `fn`, in the coordinates that it depends on.
 
-        `own` picks these from all, and `gradients` are the derivatives with respect to
-        them. Corrections by rows couple no coordinates that the function does not.
+        `select` picks these coordinates, and `gradients` are the derivatives with respect
+        to them. A correction of each row couples only coordinates that `fn` couples.
         """
         mean = self._mean(gradients, a, b)
-        close = jax.vmap(lambda *ends: _closed(*ends, weights=1.0, size=0.0))
-        return close(fn(a), fn(b), own(a), own(b), mean)
+        correct = jax.vmap(lambda *ends: _corrected(*ends, weights=1.0, size=0.0))
+        return correct(fn(a), fn(b), select(a), select(b), mean)
 
 
 class Gonzalez(AbstractCorrected):
     """Gonzalez' midpoint discrete gradient: one gradient and two evaluations.
 
-    Second-order accurate; exact midpoint gradient for quadratic functions. Keeps no
-    symmetry of `fn`: momenta are conserved to second order only.
+    Second-order accurate; the midpoint gradient if `fn` is quadratic. It does not keep the
+    symmetries of `fn`, so momenta are conserved to second order only.
 
     **Reference:** O. Gonzalez, Time integration and discrete Hamiltonian systems,
     J. Nonlinear Sci. 6 (1996) 449-467.
@@ -120,13 +120,13 @@ class MeanValue(AbstractCorrected):
 
     With two or more points it approximates the mean-value (averaged vector field)
     discrete gradient to fourth order, so that it limits neither the third order of the
-    decaying schemes nor the fourth of `EnergyConsistent`. Costs one gradient a point
-    and two evaluations.
+    decaying schemes nor the fourth order of `EnergyConsistent`. It costs one gradient for
+    each point and two evaluations of the function.
 
     **Arguments:**
 
-    - `points`: number of Gauss points, at least 1. More than 2 lower the error of a
-      strongly curved potential, not the order.
+    - `points`: number of Gauss points, at least 1. More than 2 reduce the error for a
+      strongly curved potential, but do not raise the order.
 
     **Reference:** G. R. W. Quispel and D. I. McLaren, A new class of energy-preserving
     numerical integration methods, J. Phys. A 41 (2008) 045206.
@@ -139,5 +139,5 @@ class MeanValue(AbstractCorrected):
             raise ValueError(f"`MeanValue(points={self.points})`: use 1 point or more.")
 
     def _quadrature(self) -> Iterable[tuple[float, float]]:
-        nodes, shares = np.polynomial.legendre.leggauss(self.points)
-        return zip(nodes.tolist(), (shares / 2).tolist(), strict=True)
+        nodes, weights = np.polynomial.legendre.leggauss(self.points)
+        return zip(nodes.tolist(), (weights / 2).tolist(), strict=True)

@@ -1,7 +1,7 @@
 """Difference quotients of elementary functions, without cancellation.
 
 `quotient(a, b)` is `(f(b) - f(a)) / (b - a)`, and `f'(a)` at `b = a`, with all derivatives.
-The even functions at the bottom (`sin x / x` and its relatives) are series, so that neither
+The even functions at the bottom (`sin x / x` and similar ones) are series, so that neither
 they nor their derivatives lose digits near zero.
 """
 
@@ -16,12 +16,22 @@ from jaxtyping import Array
 
 Quotient = Callable[[Array, Array], Array]
 
+# The series of `atan x / x` and `atanh x / x` are used below this argument. There 16 terms
+# reach round-off: the next is 0.25^32 / 33, about 2e-21.
+_SMALL_RATIO = 0.25
+_TERMS_OF_ATAN = 16
+# Those of `sin x / x` and `sinh x / x` are used below 1, where 11 terms reach round-off:
+# the next is 1 / 23!, about 4e-23.
+_TERMS_OF_SIN = 11
+# Gauss points of a mean slope: exact to degree 23.
+_GAUSS_POINTS = 12
+
 
 def _split(d: Array, near: Callable[[Array], Array], change: Array) -> Array:
-    """`near(d)` for small differences `d`, else `change / d`.
+    """`near(d)` for differences `d` below 1, else `change / d`.
 
-    Beyond 1 that quotient loses no more than the rounding of the values; both of them are
-    at hand, so nothing is evaluated for it.
+    From 1 on this quotient loses no more than the rounding of the values, which have been
+    computed anyway.
     """
     small = jnp.abs(d) < 1
     quotient = change / jnp.where(small, 1, d)
@@ -49,7 +59,7 @@ def exp(a: Array, b: Array) -> Array:
 
 
 def exp_of(change: Array, a: Array, b: Array) -> Array:
-    """Of the exponential, from the change of its argument and its two values."""
+    """The quotient of `exp`, from the change of its argument and its two values."""
     mean = jnp.sqrt(a) * jnp.sqrt(b)
     return _split(change, lambda d: mean * _sinhc(0.5 * d), b - a)
 
@@ -70,7 +80,7 @@ def cosh(a: Array, b: Array) -> Array:
 
 
 def tanh(a: Array, b: Array) -> Array:
-    # Where both values are close to 1, neither may be subtracted from the other.
+    # Two values close to 1 are subtracted by their differences from 1, which keep digits.
     limit = 0.2 * math.log(float(jnp.finfo(a.dtype).max))
     clipped = lambda x: jnp.clip(x, -limit, limit)
     near = 1 / (jnp.cosh(clipped(a)) * jnp.cosh(clipped(b)))
@@ -90,8 +100,8 @@ def logistic(a: Array, b: Array) -> Array:
 
 
 def log(a: Array, b: Array) -> Array:
-    # Where a logarithm is not defined, but its slope is, a selection may ask for the
-    # quotient without choosing the logarithm; that of the modulus has this slope.
+    # For negative arguments this is the quotient of log|x|, which has the same slope: a
+    # `where` may evaluate it without choosing it.
     return _log_ratio(b - a, a + b, jnp.log(jnp.abs(b)) - jnp.log(jnp.abs(a)))
 
 
@@ -101,11 +111,18 @@ def log1p(a: Array, b: Array) -> Array:
 
 
 def _log_ratio(d: Array, total: Array, change: Array) -> Array:
-    """Of the logarithm, from the difference and the sum of its arguments."""
-    near = jnp.abs(d) < 0.25 * jnp.abs(total)
-    ratio = jnp.where(near, d, 0) / jnp.where(near, total, 1)
-    series = 2 * _atanhc(ratio) / jnp.where(near, total, 1)
-    return jnp.where(near, series, change / jnp.where(near, 1, d))
+    """The quotient of `log`, from the difference and the sum of its arguments."""
+    near = jnp.abs(d) < _SMALL_RATIO * jnp.abs(total)
+    return _series_or_quotient(near, d, total, lambda x: 2 * _atanhc(x), change)
+
+
+def _series_or_quotient(
+    near: Array, d: Array, total: Array, series: Callable[[Array], Array], change: Array
+) -> Array:
+    """`series(d / total) / total` where `near`, else `change / d`."""
+    total = jnp.where(near, total, 1)
+    ratio = jnp.where(near, d, 0) / total
+    return jnp.where(near, series(ratio) / total, change / jnp.where(near, 1, d))
 
 
 def sqrt(a: Array, b: Array) -> Array:
@@ -131,10 +148,10 @@ def integer_pow(a: Array, b: Array, n: int) -> Array:
 
 
 def half_integer_pow(a: Array, b: Array, n: int) -> Array:
-    """Of `sqrt(x)**n` with an odd `n`."""
+    """The quotient of `sqrt(x)**n` with an odd `n`."""
     if abs(n) == 1:
         return sqrt(a, b) if n == 1 else rsqrt(a, b)
-    # The square root itself has no derivative at zero, where this power has.
+    # The square root has no derivative at zero, but its powers from 3 on have.
     root = lambda x: jnp.where(x == 0, 0, jnp.sqrt(jnp.where(x == 0, 1, x)))
     root_a, root_b = root(a), root(b)
     total = root_a + root_b
@@ -143,7 +160,7 @@ def half_integer_pow(a: Array, b: Array, n: int) -> Array:
 
 
 def pow(a: Array, b: Array, exponent: Array) -> Array:
-    """Of `x**exponent`, also of negative numbers where the exponent is whole."""
+    """The quotient of `x**exponent`, also for negative `x` and a whole exponent."""
     signs = jnp.where(a > 0, 1, 0) * jnp.where(b > 0, 1, 0)
     mirrored = jnp.where(a < 0, 1, 0) * jnp.where(b < 0, 1, 0)
     alike = signs + mirrored > 0
@@ -152,7 +169,7 @@ def pow(a: Array, b: Array, exponent: Array) -> Array:
     slope = slope * log(size_a, size_b)
     minus_one = jnp.where(mirrored > 0, -1, 1).astype(a.dtype)
     slope = jnp.where(mirrored > 0, -(minus_one**exponent) * slope, slope)
-    # From zero or across it nothing cancels, unless both ends are zero.
+    # If one end is zero, or the signs differ, nothing cancels, unless both ends are zero.
     apart = jnp.where(alike | (a == b), 1, b - a)
     there = lambda x: jnp.where(alike, 1, x) ** exponent
     at_zero = exponent * jnp.where(alike, 1, a) ** (exponent - 1)
@@ -162,32 +179,25 @@ def pow(a: Array, b: Array, exponent: Array) -> Array:
 
 
 def atan(a: Array, b: Array) -> Array:
-    # The angle between (1, a) and (1, b): never beyond a half turn.
+    # The angle between (1, a) and (1, b), which is less than half a turn.
     return angle_ratio(b - a, 1 + a * b)
 
 
 def atanh(a: Array, b: Array) -> Array:
     d, total = b - a, 1 - a * b
-    near = jnp.abs(d) < 0.25 * jnp.abs(total)
-    ratio = jnp.where(near, d, 0) / jnp.where(near, total, 1)
-    # Beyond 1 of the inverse of the coth, which has the same slope.
+    near = jnp.abs(d) < _SMALL_RATIO * jnp.abs(total)
+    # Beyond 1 this is the quotient of the inverse of coth, which has the same slope.
     inside = lambda x: jnp.arctanh(
         jnp.where(jnp.abs(x) > 1, 1 / jnp.where(x == 0, 1, x), x)
     )
-    change = inside(b) - inside(a)
-    return jnp.where(
-        near, _atanhc(ratio) / jnp.where(near, total, 1), change / jnp.where(near, 1, d)
-    )
+    return _series_or_quotient(near, d, total, _atanhc, inside(b) - inside(a))
 
 
 def angle_ratio(cross: Array, dot: Array) -> Array:
     """The angle `atan2(cross, dot)` over `cross`."""
-    near = jnp.abs(cross) < 0.25 * dot
-    ratio = jnp.where(near, cross, 0) / jnp.where(near, dot, 1)
+    near = jnp.abs(cross) < _SMALL_RATIO * dot
     angle = jnp.arctan2(jnp.where(near, 0, cross), jnp.where(near, 1, dot))
-    return jnp.where(
-        near, _atanc(ratio) / jnp.where(near, dot, 1), angle / jnp.where(near, 1, cross)
-    )
+    return _series_or_quotient(near, cross, dot, _atanc, angle)
 
 
 def absolute(a: Array, b: Array) -> Array:
@@ -198,13 +208,13 @@ def absolute(a: Array, b: Array) -> Array:
 
 
 def smooth(function: Callable[[Array], Array], reach: float) -> Quotient:
-    """Of a smooth function without an addition theorem.
+    """The quotient of a smooth function without an addition theorem.
 
-    Within `reach` the mean of the derivative by Gauss quadrature, exact to round-off where
-    `reach` is well within the convergence of the function's series; the plain quotient
-    beyond, where it has no cancellation to speak of.
+    Within `reach` it is the mean of the derivative by Gauss quadrature, which is exact to
+    round-off if `reach` is well within the radius of convergence of the function's series.
+    Beyond, it is the plain quotient, in which hardly anything cancels.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(12)
+    nodes, weights = np.polynomial.legendre.leggauss(_GAUSS_POINTS)
 
     def quotient(a: Array, b: Array) -> Array:
         mid, half = 0.5 * (a + b), 0.5 * (b - a)
@@ -234,16 +244,14 @@ def _even(series: Sequence[float]) -> Callable[[Array], Array]:
 
 
 def _factorials(sign: int) -> list[float]:
-    return [sign**k / math.factorial(2 * k + 1) for k in range(11)]
+    return [sign**k / math.factorial(2 * k + 1) for k in range(_TERMS_OF_SIN)]
 
 
 def _odd_numbers(sign: int) -> list[float]:
-    return [sign**k / (2 * k + 1) for k in range(16)]
+    return [sign**k / (2 * k + 1) for k in range(_TERMS_OF_ATAN)]
 
 
-# For |x| < 1.
 _sinc = _even(_factorials(-1))
 _sinhc = _even(_factorials(1))
-# For |x| < 1/4.
 _atanc = _even(_odd_numbers(-1))
 _atanhc = _even(_odd_numbers(1))

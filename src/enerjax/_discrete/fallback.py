@@ -27,7 +27,7 @@ def fallback(primitive: Any, values: list[Value], params: dict[str, Any]) -> lis
     moving = [k for k, v in enumerate(values) if isinstance(v, Moving)]
     switching = [v for v in values if isinstance(v, Switching)]
     if not moving:
-        return _shared_out(primitive, values, params)
+        return _shared(primitive, values, params)
     start, unravel = ravel_pytree([values[k].a for k in moving])
     end, _ = ravel_pytree([values[k].b for k in moving])
     d, _ = ravel_pytree([values[k].d for k in moving])
@@ -46,8 +46,8 @@ def fallback(primitive: Any, values: list[Value], params: dict[str, Any]) -> lis
             "numbers. Write the function with real numbers: cos and sin, real and "
             "imaginary parts."
         )
-    # Forward mode, for a `while` has no other, and a `custom_vjp` none but reverse mode.
-    # Choices stand as at either end in turn, which keeps the symmetry.
+    # A `while` has only forward mode, and a `custom_vjp` only reverse mode. Choices are
+    # taken once as at `a` and once as at `b`, which keeps the symmetry.
     is_reverse = primitive.name == "custom_vjp_call"
     jacobian = _reverse_jacobian if is_reverse else jax.jacfwd
     choices = (at_a, at_b) if switching else (at_a,)
@@ -73,7 +73,7 @@ def fallback(primitive: Any, values: list[Value], params: dict[str, Any]) -> lis
 
 
 def _reverse_jacobian(fn: Callable[[Array], list[Array]]) -> Callable:
-    """The Jacobians of the outputs; of those that are not real, `None`."""
+    """The Jacobian of each output; `None` for those that are not real."""
 
     def of(x: Array) -> list[Array | None]:
         real = [jnp.issubdtype(out.dtype, jnp.inexact) for out in jax.eval_shape(fn, x)]
@@ -84,21 +84,21 @@ def _reverse_jacobian(fn: Callable[[Array], list[Array]]) -> Callable:
     return of
 
 
-def _shared_out(primitive: Any, values: list[Value], params: dict[str, Any]) -> list[Value]:
-    """Where choices alone move: the true difference, shared among what decided them."""
+def _shared(primitive: Any, values: list[Value], params: dict[str, Any]) -> list[Value]:
+    """If only choices differ: the difference, shared among what decided them."""
     squares, decided = _totals([v for v in values if isinstance(v, Switching)])
     outs = []
     ends = [evaluate(primitive, list(map(at, values)), params) for at in (at_a, at_b)]
     for a, b in zip(*ends, strict=True):
-        if not jnp.issubdtype(a.dtype, jnp.inexact):
+        if jnp.issubdtype(a.dtype, jnp.inexact):
+            outs.append(Moving(a, b, share(b - a, squares, decided)))
+        else:
             outs.append(_choice(a, b, squares, decided))
-            continue
-        outs.append(Moving(a, b, share(b - a, squares, decided)))
     return outs
 
 
 def _totals(choices: list[Switching]) -> tuple[Array, Array]:
-    total = lambda parts: sum(map(jnp.sum, parts), jnp.zeros(()))
+    total = lambda arrays: sum(map(jnp.sum, arrays), jnp.zeros(()))
     return total([v.squares for v in choices]), total([v.decided for v in choices])
 
 

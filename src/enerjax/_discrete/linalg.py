@@ -1,9 +1,9 @@
 """Rules of matrix factorisations and solves: the product rule, solved for the factor.
 
-Each satisfies the equation that defines its output with the means of the two points in the
-places of the factors, so that the difference is exact: `A x = b` gives
-`mean(A) dx = db - dA mean(x)`. The mean of two regular matrices can be singular (between a
-rotation and its opposite): the increment is then not finite.
+The product rule of the equation that defines an output is exact if each factor is replaced
+by its mean over the two points: `A x = b` gives `mean(A) dx = db - dA mean(x)`. The mean of
+two regular matrices can be singular (that of a rotation and its opposite is zero); the
+increment is then not finite.
 """
 
 from typing import Any
@@ -15,7 +15,17 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from .arithmetic import both
-from .transform import at_a, at_b, increment, moves, Moving, NoRule, Switching, Value
+from .transform import (
+    at_a,
+    at_b,
+    increment,
+    moves,
+    Moving,
+    NoRule,
+    refuse_choices,
+    Switching,
+    Value,
+)
 
 
 def _transposed(x: Array) -> Array:
@@ -47,7 +57,7 @@ def triangular_solve(values: list[Value], params: dict[str, Any]) -> list[Value]
     ((a, b),) = both(values, params)
     matrix, right = values
     lower, unit = params["lower"], params["unit_diagonal"]
-    # The entries that the solve reads: without the diagonal where that counts as one.
+    # The solve reads one triangle, without the diagonal if `unit_diagonal` replaces that.
     offset = int(unit)
     entries = jnp.ones(at_a(matrix).shape, bool)
     used = jnp.tril(entries, -offset) if lower else jnp.triu(entries, offset)
@@ -63,12 +73,11 @@ def triangular_solve(values: list[Value], params: dict[str, Any]) -> list[Value]
 
 
 def linear_solve(values: list[Value], params: dict[str, Any]) -> list[Value]:
-    """`matvec(x) = b`: what factorised the matrix does not matter, its product does."""
+    """`matvec(x) = b`: the rule needs the product with the matrix, not the solver."""
     lengths, program = params["const_lengths"], params["jaxprs"].matvec
     consts = values[: lengths.matvec]
     right = values[sum(lengths) :]
-    if any(isinstance(v, Switching) for v in (*consts, *right)):
-        raise NoRule
+    refuse_choices([*consts, *right])
     ends = both(values, params)
     walk = params["walk"]
     means = [0.5 * (a + b) for a, b in ends]
@@ -99,8 +108,8 @@ def _solve(program: Any, consts: list[Array], right: list[Array]) -> list[Array]
 def _column_axis(jaxpr: Any) -> tuple[int, int] | None:
     """The contracted axes of matrix and `x`, if the program is a product with one matrix.
 
-    Many right-hand sides (an inverse) are then solved for with one small matrix, where the
-    general way would take them for one long vector.
+    Several right-hand sides, as for an inverse, then share one small matrix. In the general
+    case they are joined to one long vector.
     """
     first = jaxpr.eqns[0]
     if first.primitive.name != "dot_general" or first.invars != jaxpr.invars:
@@ -113,17 +122,17 @@ def _column_axis(jaxpr: Any) -> tuple[int, int] | None:
 
 
 def inverse(values: list[Value], params: dict[str, Any]) -> list[Value]:
-    """`X_b - X_a = -X_b dA X_a`, in both orders: no third inverse."""
+    """`X_b - X_a = -X_b dA X_a`, averaged with the opposite order."""
     (matrix,) = values
     ((a, b),) = both(values, params)
     return [Moving(a, b, -0.5 * (a @ matrix.d @ b + b @ matrix.d @ a))]
 
 
 def lu(values: list[Value], params: dict[str, Any]) -> list[Value]:
-    """`P dA = dL Um + Lm dU`, where both points pivot alike.
+    """`P dA = dL Um + Lm dU`, if both points have the same pivots.
 
-    Where they do not, the factors of `b` with the rows of `a` have no relation to those
-    that were asked for: the true difference is shared out over the matrix.
+    Otherwise no product rule relates the two factorisations, and their difference is shared
+    among the entries of the matrix.
     """
     (matrix,) = values
     (fa, fb), (pa, pb), (ra, rb) = both(values, params)
@@ -131,7 +140,7 @@ def lu(values: list[Value], params: dict[str, Any]) -> list[Value]:
         raise NoRule
     mean = 0.5 * (fa + fb)
     eye = jnp.eye(mean.shape[0], dtype=mean.dtype)
-    # Pivots that change sign leave a mean without inverse.
+    # A pivot that changes its sign may have the mean zero.
     keep = jnp.diagonal(fa) * jnp.diagonal(fb) > 0
     same = jnp.all(ra == rb) & jnp.all(keep)
     lower = jnp.tril(mean, -1) + eye

@@ -8,37 +8,44 @@ from jaxtyping import Array
 
 from .arithmetic import both
 from .choices import share
-from .transform import at_a, at_b, increment, Moving, NoRule, Switching, Value
+from .transform import (
+    at_a,
+    at_b,
+    increment,
+    Moving,
+    NoRule,
+    refuse_choices,
+    Switching,
+    Value,
+)
+
+
+def _with_increments(values: list[Value], inexact: list[bool]) -> list[Value]:
+    """The values, of which inexact ones get an increment even if they do not differ."""
+    return [
+        Moving(at_a(v), at_b(v), increment(v)) if flag else v
+        for v, flag in zip(values, inexact, strict=True)
+    ]
 
 
 def scan(values: list[Value], params: dict[str, Any]) -> list[Value]:
-    """A scan over the rule of its body, the increment carried along."""
+    """A scan over the rule of its body, which carries the increment along."""
     walk, body = params["walk"], params["jaxpr"]
     num_consts, num_carry = params["num_consts"], params["num_carry"]
-    if any(isinstance(v, Switching) for v in values):
-        raise NoRule
+    refuse_choices(values)
     consts, carry = values[:num_consts], values[num_consts : num_consts + num_carry]
     xs = values[num_consts + num_carry :]
-    # What starts still may move later: carry an increment wherever there can be one.
-    floating = [jnp.issubdtype(jnp.result_type(at_a(c)), jnp.inexact) for c in carry]
-    begin = [
-        Moving(at_a(c), at_b(c), increment(c)) if f else c
-        for c, f in zip(carry, floating, strict=True)
-    ]
+    # A carry that is the same at both points at first may differ later.
+    inexact = [jnp.issubdtype(jnp.result_type(at_a(c)), jnp.inexact) for c in carry]
 
     def one(carry: list[Value], xs: list[Value]):
         outs = walk.closed(body, [*consts, *carry, *xs])
-        if any(isinstance(v, Switching) for v in outs):
-            raise NoRule
-        after = [
-            Moving(at_a(c), at_b(c), increment(c)) if f else c
-            for c, f in zip(outs[:num_carry], floating, strict=True)
-        ]
-        return after, outs[num_carry:]
+        refuse_choices(outs)
+        return _with_increments(outs[:num_carry], inexact), outs[num_carry:]
 
     after, ys = jax.lax.scan(
         one,
-        begin,
+        _with_increments(carry, inexact),
         xs,
         length=params["length"],
         reverse=params["reverse"],
@@ -48,22 +55,17 @@ def scan(values: list[Value], params: dict[str, Any]) -> list[Value]:
 
 
 def cond(values: list[Value], params: dict[str, Any]) -> list[Value]:
-    """The rule of the branch that both points take; the true quotient where they part."""
+    """The rule of the branch if both points take the same; else the difference quotient."""
     walk, branches = params["walk"], params["branches"]
     which, *operands = values
-    if any(isinstance(v, Switching) for v in operands):
-        raise NoRule
+    refuse_choices(operands)
     inexact = [jnp.issubdtype(x.dtype, jnp.inexact) for x in branches[0].out_avals]
 
     def branch(program):
         def run(operands: list[Value]) -> list[Value]:
             outs = walk.closed(program, operands)
-            if any(isinstance(v, Switching) for v in outs):
-                raise NoRule
-            return [
-                Moving(at_a(v), at_b(v), increment(v)) if f else v
-                for v, f in zip(outs, inexact, strict=True)
-            ]
+            refuse_choices(outs)
+            return _with_increments(outs, inexact)
 
         return run
 
@@ -74,13 +76,14 @@ def cond(values: list[Value], params: dict[str, Any]) -> list[Value]:
         raise NoRule
     ends = both(values, params)
 
-    def together(operands: list[Value]) -> list[Array]:
+    def of_branch(operands: list[Value]) -> list[Array]:
         return [out.d for out in jax.lax.switch(which.a, runs, operands)]
 
-    def apart(operands: list[Value]) -> list[Array]:
+    def of_difference(operands: list[Value]) -> list[Array]:
         del operands
         squares, decided = jnp.sum(which.squares), jnp.sum(which.decided)
         return [share(b - a, squares, decided) for a, b in ends]
 
-    increments = jax.lax.cond(which.a == which.b, together, apart, operands)
+    is_same = which.a == which.b
+    increments = jax.lax.cond(is_same, of_branch, of_difference, operands)
     return [Moving(a, b, d) for (a, b), d in zip(ends, increments, strict=True)]

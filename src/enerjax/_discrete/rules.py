@@ -9,13 +9,13 @@
 | `pow` | of `exp(y log x)`, with its limits at zero; of `sqrt(x)**n` for a fixed half-integer power |
 | `atan2` | angle turned, from the cross and dot products of the two points |
 | `max`, `min`, `clamp`, `reduce_max` | from that of `abs` |
-| `sign`, `floor`, `ceil`, `round` | the true quotient across a step, else zero |
-| comparisons, `select_n`, `cond` | exact where the choice is the same at both points; else the true difference quotient with respect to what decided |
+| `sign`, `floor`, `ceil`, `round` | the difference quotient across a step, else zero |
+| comparisons, `select_n`, `cond` | exact if the choice is the same at both points; else the difference quotient with respect to the numbers that decided |
 | `reduce_prod` | telescoping product, in both orders |
 | `cholesky`, `triangular_solve`, `custom_linear_solve`, `lu`, inverse | `linalg.py` |
 | `scan` | the rule of its body, with the increment in the carry |
 | `jit`, `remat`; functions of JAX with a derivative of their own | of the program inside |
-| other functions under `custom_jvp`, `custom_vjp` | `fallback.py`, with the derivative that was given |
+| other functions under `custom_jvp`, `custom_vjp` | `fallback.py`, with the derivative that they define |
 | all others | `fallback.py` |
 """  # noqa: E501
 
@@ -34,7 +34,7 @@ RULES: dict[str, Rule] = {
     **dict.fromkeys(["cumsum", "reduce_sum", "sharding_constraint"], linear()),
     "scatter-add": linear(0, 2),
     **dict.fromkeys("add sub neg add_any".split(), choices.sum_entries),
-    # The value moves whether it is differentiated or not.
+    # The values differ, although their derivative is stopped.
     **dict.fromkeys(
         ["stop_gradient", "optimization_barrier"], lambda values, params: values
     ),

@@ -13,12 +13,12 @@ included. And because the map follows the user's own composition (differences of
 then dot products, then functions of distances), it inherits the symmetries that the program
 shows: a discrete gradient of a function of distances exerts no net force and no torque.
 
-**To add a rule:** enter `rule(values, params)` in the table of `rules.py` under the name
-that the primitive has in `jax.make_jaxpr`, made with the helpers of `arithmetic.py`. (A
-function under `jax.jit` can have a rule too, as `"jit name"`.) `values` has one entry an
-operand, plain where the operand is the same at `a` and `b`, else a `Moving`; return the
-same for each output. `params` are those of the primitive, with the `primitive` itself and
-the `walk`.
+**To add a rule:** write it with the helpers of `arithmetic.py`, and enter `rule(values,
+params)` in the table of `rules.py` under the name that the primitive has in
+`jax.make_jaxpr`. (A function under `jax.jit` can have a rule too, as `"jit name"`.)
+`values` has one entry for each operand: a plain array if the operand is the same at `a` and
+`b`, else a `Moving`. Return the same for each output. `params` are those of the primitive,
+together with the `primitive` itself and the `walk`.
 """
 
 from collections.abc import Callable
@@ -49,9 +49,10 @@ class Moving(NamedTuple):
 class Switching(NamedTuple):
     """A truth value or integer that may differ between the two points.
 
-    It has no increment. What decided it is kept in its place: the sum of the squares of the
-    changes of the deciding numbers, and of their products with their increments. Where the
-    value differs, `change * decided / squares` is an increment with the right total.
+    It has no increment. Instead it keeps two sums over the numbers that decided it:
+    `squares`, of their squared changes, and `decided`, of the products of their changes and
+    increments. If the value changes by `change`, then `change * decided / squares` is an
+    increment with the right total.
     """
 
     a: Array
@@ -81,7 +82,13 @@ def moves(value: Value) -> bool:
 
 
 class NoRule(Exception):
-    """A rule that does not cover these operands; the fallback does."""
+    """Raised by a rule that does not cover its operands; the fallback does."""
+
+
+def refuse_choices(values: list[Value]) -> None:
+    """Raises `NoRule` if a truth value or an integer among the operands may change."""
+    if any(isinstance(v, Switching) for v in values):
+        raise NoRule
 
 
 class Walk:
@@ -96,7 +103,7 @@ class Walk:
         return self.open(jaxpr.jaxpr, jaxpr.consts, inputs)
 
     def open(self, jaxpr: Any, consts: list[Value], inputs: list[Value]) -> list[Value]:
-        """The outputs of a program for inputs that may move."""
+        """The outputs of a program for inputs that may differ between the two points."""
         constants = [c if moves(c) else jnp.asarray(c) for c in consts]
         return interpret(jaxpr, constants, inputs, self._equation)
 
@@ -120,11 +127,11 @@ class Walk:
             return outs
 
     def _is_smooth(self, equation: Any, inner: Any) -> bool:
-        """Whether the derivative of what an equation wraps is that of the program inside.
+        """Whether the derivative of a wrapped program is that of its equations.
 
-        A user may give another one: a slope to a look-up in a table, or to the norm of a
-        vector that vanishes. Functions of JAX and of this library give that of the program
-        inside, unless that works on the bits of a number: it has primitives without rules.
+        Users may define another derivative, such as a slope for a look-up in a table.
+        Functions of JAX and of this library have the derivative of their equations, except
+        those that operate on the bits of a number, whose primitives have no rules.
         """
         given = function_with_own_derivative(equation)
         return given is None or (given[1] and self._has_rules(inner))
