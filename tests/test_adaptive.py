@@ -179,7 +179,7 @@ def test_a_step_that_newton_fails_in_is_repeated_shorter():
 
 
 def test_schemes_with_a_memory_of_the_step_are_refused():
-    with pytest.raises(ValueError, match="GeneralizedAlpha.*one length"):
+    with pytest.raises(ValueError, match="GeneralizedAlpha.*one step length"):
         adaptive("pendulum", ej.GeneralizedAlpha(0.9), 1e-6, 1.0)
 
 

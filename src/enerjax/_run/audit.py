@@ -1,4 +1,4 @@
-"""Energies, momenta and constraint residuals along a run, to judge it by."""
+"""Energies, momenta and constraint residuals along a run, by which to judge it."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,25 +13,27 @@ from ..schemes import Energies
 
 
 class Audit(eqx.Module):
-    """What a run did to the energy and to the constraints, at each saved time.
+    """The energy and the constraints at each saved time of a run.
 
-    `print(solution.audit)` tells it in short.
+    `print(solution.audit)` shows a summary. "Since the row before" means: summed over the
+    steps between two saved times; such entries are 0 in row 0.
 
     - `kinetic`, `potential`, `energy`: shape `(times,)` (energy).
     - `dissipated`: shape `(times,)`, the energy that the scheme removed since the row
-      before, by its own identity; 0 in row 0.
-    - `work`, `drive_work`: shape `(times,)`, the work of `force` (dampers included) and
-      that of `driven` constraints on the system since the row before; 0 where the system
-      has none. Joints do no work: their discrete gradient is orthogonal to what they hold.
-    - `damped`: shape `(times,)`, what dampers took: the work, with the other sign, of the
-      part of `force` that changes sign with the velocity, `(f(q, v, t) - f(q, -v, t))/2`.
-    - `leak`: shape `(times,)`, what this leaves of the change of the energy since the row
-      before, `energy[k] = energy[k-1] + work[k] + drive_work[k] - dissipated[k] + leak[k]`:
-      round-off, what Newton left, and what a scheme without an energy identity loses on
-      joints. Not of the size of round-off: do not believe the run.
+      before, according to its energy identity.
+    - `work`, `drive_work`: shape `(times,)`, the work of `force` (including dampers) and of
+      `driven` constraints on the system since the row before. Joints do no work: their
+      discrete gradient is orthogonal to the displacement.
+    - `damped`: shape `(times,)`, the energy that dampers removed since the row before:
+      minus the work of `(f(q, v, t) - f(q, -v, t))/2`, the part of `force` that changes its
+      sign with the velocity.
+    - `leak`: shape `(times,)`, the change of the energy that the others do not explain,
+      `energy[k] = energy[k-1] + work[k] + drive_work[k] - dissipated[k] + leak[k]`. It
+      consists of round-off, the residual of Newton's method, and the error of schemes
+      without an energy identity. If it is far above round-off, do not trust the run.
     - `momentum`: shape `(times, ns)`, of each `symmetry` of the system.
-    - `constraint`: shape `(times, nc)`, residuals of the constraints: joints, driven ones,
-      relations between coordinates, in their own units.
+    - `constraint`: shape `(times, nc)`, residuals of joints, driven constraints and
+      relations between coordinates, each in its own unit.
     - `constraint_rate`: shape `(times, nj)`, residuals of joints and driven constraints
       at velocity level.
     """
@@ -60,7 +62,7 @@ class Audit(eqx.Module):
 
 
 class Measures(eqx.Module):
-    """What the audit tells of one state; the names are those of `Audit`."""
+    """The entries of an `Audit` that belong to one state."""
 
     kinetic: Scalar
     potential: Scalar
@@ -70,7 +72,6 @@ class Measures(eqx.Module):
 
 
 def measures(model: AbstractModel, state: State) -> Measures:
-    """Energies, momenta and residuals of the constraints in a state."""
     return Measures(
         kinetic=model.kinetic(state),
         potential=model.potential(state),
@@ -81,8 +82,8 @@ def measures(model: AbstractModel, state: State) -> Measures:
 
 
 def audit(rows: Measures, energies: Energies) -> Audit:
-    """The audit of rows, and of the energies between them, with a leading time axis."""
-    # Where a row is not a number, none of its entries is.
+    """The audit of rows and of the energies between them, both with a leading time axis."""
+    # In rows that are NaN this zero is NaN too.
     none = 0 * energies.dissipated
     return Audit(
         kinetic=rows.kinetic,
@@ -98,7 +99,7 @@ def audit(rows: Measures, energies: Energies) -> Audit:
 
 
 def _report(audit: Audit) -> str:
-    """One line for each kind of entry; of a batch the worst lane."""
+    """One line for each entry; for a batch, that of its worst lane."""
     rows = np.isfinite(np.asarray(audit.energy))
     kept = lambda x: np.where(rows, np.asarray(x), 0.0)
     total = lambda x: _worst(np.sum(kept(x), axis=-1))
@@ -130,7 +131,7 @@ def _report(audit: Audit) -> str:
 
 
 def _last(x: Array) -> np.ndarray:
-    """The last entry of each lane that is a number."""
+    """The last entry of each lane that is not NaN."""
     last = np.isfinite(np.asarray(x)).sum(axis=-1) - 1
     return np.take_along_axis(np.asarray(x), last[..., None], axis=-1)[..., 0]
 

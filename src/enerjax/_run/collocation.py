@@ -1,10 +1,11 @@
 """The motion within a step as a polynomial, from the rates of change along it.
 
-The equations of motion, their constraints differentiated twice, say how positions and
-velocities change in any state. Between the two ends of a step, where states and rates are
-known, a cubic Hermite polynomial gives states at a few nodes, of error `h^4`. The rates
-there, integrated, give better ones: each turn gains one order (Picard's iteration), up to
-the order of the nodes. The integral over the whole step is a second opinion about its end.
+The equations of motion, with constraints differentiated twice, give the rates of positions
+and velocities in any state. A cubic Hermite polynomial through the states and rates at
+both ends of a step gives the states at a few nodes, with an error of `h^4`. Integrating
+the rates there gives better states (Picard's iteration): each iteration gains one order,
+up to that of the nodes. The integral over the whole step is an independent estimate of its
+end.
 """
 
 import functools
@@ -15,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._analysis import project_position, project_velocity
 from .._operators import AbstractModel, Time
 from .._system import State
 from .._types import Coordinates, Scalar, Velocities
@@ -34,7 +36,7 @@ def rates(model: AbstractModel, state: State) -> Pair:
 def _lobatto(num: int) -> tuple[Numbers, Numbers]:
     """Lobatto's nodes on [0, 1], and the integrals from 0 of the Lagrange polynomials.
 
-    The latter as coefficients: row `j` belongs to node `j`, column `k` to `x^(k+1)`.
+    The integrals are coefficients: row `j` belongs to node `j`, column `k` to `x^(k+1)`.
     """
     inner = np.polynomial.legendre.Legendre.basis(num - 1).deriv().roots()
     nodes = 0.5 * (1 + np.concatenate([[-1.0], np.sort(inner.real), [1.0]]))
@@ -43,7 +45,7 @@ def _lobatto(num: int) -> tuple[Numbers, Numbers]:
 
 
 def _weights(num: int, x: Any) -> Any:
-    """The integrals from 0 to `x` of the Lagrange polynomials: last axis, the nodes."""
+    """The integrals from 0 to `x` of the Lagrange polynomials, with the nodes last."""
     _, integrals = _lobatto(num)
     numbers: Any = np if isinstance(x, np.ndarray) else jnp
     powers = numbers.stack([x**k for k in range(1, num + 1)], axis=-1)
@@ -51,7 +53,10 @@ def _weights(num: int, x: Any) -> Any:
 
 
 def _combine(weights: Float[Array, "... n"], values: Any) -> Any:
-    """Sums over the leading axis of `values`, written out: small products in a loop."""
+    """Weighted sums over the leading axis of `values`.
+
+    They are written out: a loop runs small matrix products more slowly than sums.
+    """
 
     def combined(x: Array) -> Array:
         rows = x.reshape(*[1] * (weights.ndim - 1), *x.shape)
@@ -78,9 +83,9 @@ def rates_along(
     h: Scalar,
     at_ends: tuple[Pair, Pair],
     num_nodes: int,
-    turns: int,
+    iterations: int,
 ) -> Pair:
-    """The rates at Lobatto's nodes of a step, whose error is `h^(4 + turns)`."""
+    """The rates at Lobatto's nodes of a step, with an error of `h^(4 + iterations)`."""
     nodes, _ = _lobatto(num_nodes)
     inner = nodes[1:-1]
     first, last = at_ends
@@ -99,15 +104,38 @@ def rates_along(
         return rates_at(jax.tree.map(lambda a, x: a[None] + h * x, begin, moved)), None
 
     f = rates_at(_hermite(inner, h, begin, (end.q, end.v), first, last))
-    return jax.lax.scan(improve, f, None, length=turns)[0] if turns > 0 else f
+    return jax.lax.scan(improve, f, None, length=iterations)[0] if iterations > 0 else f
 
 
 def integral(f: Pair, x: Scalar) -> Pair:
-    """What the rates at the nodes, `(nodes, n)` each, add from 0 to `x`, divided by `h`."""
+    """The integral of the rates at the nodes, `(nodes, n)`, from 0 to `x`, over `h`."""
     return _combine(_weights(f[0].shape[0], x), f)
 
 
 def end_of(start: State, h: Scalar, f: Pair, t: Time) -> State:
-    """Where the integrated rates lead."""
+    """The end of a step by the integral of the rates."""
     q, v = integral(f, jnp.ones((), h.dtype))
     return State(start.q + h * q, start.v + h * v, t)
+
+
+def state_within(
+    model: AbstractModel, a: State, b: State, h: Scalar, part: Scalar, order: int
+) -> State:
+    """The state at the fraction `part` of a step from `a` to `b`, to `h^(order + 1)`.
+
+    It is that of the collocation polynomial, which is shifted so that it ends in `b`,
+    projected onto the constraints at position and velocity level. At the ends of the step
+    it is `a` or `b` itself.
+    """
+    at_ends = rates(model, a), rates(model, b)
+    f = rates_along(model, a, b, h, at_ends, max(order, 3), max(order - 4, 0))
+    q, v = integral(f, part)
+    reached = end_of(a, h, f, b.t)
+    blend = part**2 * (3 - 2 * part)
+    q = a.q + h * q + blend * (b.q - reached.q)
+    v = a.v + h * v + blend * (b.v - reached.v)
+    t = None if a.t is None else a.t + part * h
+    q, _ = project_position(model, State(q, v, t), ())
+    v, _ = project_velocity(model, State(q, v, t), ())
+    at_end = lambda x, x0, x1: jnp.where(part == 0, x0, jnp.where(part == 1, x1, x))
+    return jax.tree.map(at_end, State(q, v, t), a, b)

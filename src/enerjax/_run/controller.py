@@ -1,4 +1,4 @@
-"""Steps of varying length, from an estimate of the error that each one makes."""
+"""Steps whose lengths are chosen by an estimate of their errors."""
 
 from typing import Any
 
@@ -21,6 +21,18 @@ from .step import StepOutput, Warm
 from .step_sizes import AbstractController, AbstractPlan, End, Verdict
 
 
+# The steps that may be attempted by default.
+MAX_STEPS = 4096
+# The factor on the length of a step in which Newton's method failed.
+_AFTER_FAILURE = 0.25
+# Of the PI controller: Gustafsson's exponents 0.7 and 0.4 and safety factor, limits of the
+# factor on the length, and the error below which it does not react any more.
+_PROPORTIONAL, _INTEGRAL = 0.7, 0.4
+_SAFETY = 0.9
+_SHORTER, _LONGER = 0.2, 5.0
+_SMALLEST_ERROR = 1e-4
+
+
 def _as_tolerance(tolerance: Real) -> Scalar:
     array = jnp.asarray(tolerance, float)
     if is_known(array) and not (array.ndim == 0 and 0 < float(array) < jnp.inf):
@@ -35,18 +47,19 @@ def _as_tolerance(tolerance: Real) -> Scalar:
 class StepController(AbstractController):
     """Chooses the steps of `simulate(..., t1=..., controller=...)` by their errors.
 
-    Each step is compared with the integral of the equations of motion along it: Picard's
-    iteration on Lobatto's nodes, from Hermite's polynomial through its ends. For schemes of
-    orders 1 to 4 the difference `d` is the error of the step itself, up to terms of higher
-    order; for orders 6 and 8 that of the integral, which is of order 5 and 7. A step is
-    accepted if
+    The end of each step is compared with the integral of the equations of motion along the
+    step: Picard's iteration on Lobatto's nodes, which starts from Hermite's polynomial
+    through both ends. For schemes of orders 1 to 4 the difference `d` is the error of the
+    step itself, up to terms of higher order; for orders 6 and 8 it is that of the integral,
+    which is of order 5 and 7. A step is accepted if
 
         sqrt(mean((d / (atol + rtol max(|y0|, |y1|)))^2)) <= 1
 
     over all coordinates and velocities (momenta of a Hamiltonian system), and otherwise
-    repeated, shorter; so is a step in which Newton's method fails, with a quarter of its
-    length. A PI controller with factors in [0.2, 5] proposes the next length. Every step
-    keeps energy and constraints as the scheme promises, at any length.
+    repeated with a shorter length. A step in which Newton's method fails is repeated with a
+    quarter of its length. A PI controller with factors in [0.2, 5] proposes the next
+    length. A step of any length has the properties of energy and constraints that the
+    scheme promises.
 
     **Arguments:**
 
@@ -69,10 +82,9 @@ class StepController(AbstractController):
     ) -> "_ControlledPlan":
         if isinstance(scheme.stage, AbstractSchemeWithMemory):
             raise ValueError(
-                f"`{type(scheme).__name__}` carries an acceleration from step to step that "
-                "belongs to one length of the steps, so no `controller` can vary it. Give "
-                "`h` and `t1` alone, or take a scheme of one step, such as "
-                "`EnergyDecaying`."
+                f"`{type(scheme).__name__}` passes an acceleration from step to step that "
+                "is valid for one step length only, so no `controller` can vary it. Pass "
+                "`h` and `t1` alone, or use a one-step scheme, such as `EnergyDecaying`."
             )
         assert end.t1 is not None
         duration = end.t1 - t0
@@ -91,33 +103,29 @@ class StepController(AbstractController):
 
 
 class _Memory(eqx.Module):
-    # Of the step to come, and of the last three that were accepted, newest first.
+    """What the controller remembers from one step to the next.
+
+    - `length`: of the next step.
+    - `before`: lengths of the last three accepted steps, newest first.
+    - `error`: of the last accepted step.
+    - `num_rejected`: the number of rejected steps in the run.
+    - `rejected`: whether a step was rejected since the last accepted one.
+    - `inaccurate`: whether one of these was rejected because of its error.
+    - `rates`: the rates of change in the current state.
+    """
+
     length: Scalar
     before: Float[Array, "3"]
-    # Of the last accepted step.
     error: Scalar
-    # How many steps were rejected in the run; whether one was since the last accepted
-    # step, and whether one was for its error.
     num_rejected: Count
     rejected: Flag
     inaccurate: Flag
-    # The rates of change in the state that is reached.
     rates: Pair
 
 
-# A step that Newton's method fails in is cut to this part.
-_CUT = 0.25
-_SAFETY = 0.9
-_SHORTER, _LONGER = 0.2, 5.0
-
-
-# Steps that a controller may try, if nothing else is said.
-MAX_STEPS = 4096
-
-
 class _ControlledPlan(AbstractPlan):
-    """The steps of a `StepController`, as parts of the whole time. Nothing is
-    differentiated by their lengths."""
+    """The steps of a `StepController`; their lengths are fractions of the whole time, and
+    are constants for derivatives."""
 
     t0: Scalar
     t1: Scalar
@@ -149,7 +157,7 @@ class _ControlledPlan(AbstractPlan):
         return jax.lax.stop_gradient(jnp.minimum(self.first_length, 1.0))
 
     def next(self, memory: _Memory, place: Scalar) -> tuple[Scalar, Scalar]:
-        # The last two steps share the rest of the time, so that none is tiny.
+        # The last two steps divide the remaining time equally, so that none is tiny.
         left = 1 - place
         last = left <= 1.01 * memory.length
         length = jnp.minimum(memory.length, 0.5 * left)
@@ -175,15 +183,16 @@ class _ControlledPlan(AbstractPlan):
         solved = out.result == RESULTS.successful
         accepted = solved & (error <= 1)
         power = 1 / estimate_order(self.order)
-        error = jnp.maximum(error, 1e-4)
-        grown = _SAFETY * error ** (-0.7 * power) * memory.error ** (0.4 * power)
+        error = jnp.maximum(error, _SMALLEST_ERROR)
+        grown = _SAFETY * error ** (-_PROPORTIONAL * power)
+        grown = grown * memory.error ** (_INTEGRAL * power)
         grown = jnp.clip(grown, _SHORTER, jnp.where(memory.rejected, 1.0, _LONGER))
         shrunk = jnp.maximum(_SAFETY * error**-power, _SHORTER)
-        # An error that is no number compares false.
-        shrunk = jnp.where(solved & (error < jnp.inf), shrunk, _CUT)
+        # An error that is NaN compares false.
+        shrunk = jnp.where(solved & (error < jnp.inf), shrunk, _AFTER_FAILURE)
         next_length = length * jnp.where(accepted, grown, shrunk)
         next_length = jax.lax.stop_gradient(next_length)
-        # The reverse pass is spared the estimates.
+        # The reverse pass keeps these two, so it need not repeat the estimates.
         accepted, next_length = checkpoint_name((accepted, next_length), ROOT)
         too_short = ~accepted & (next_length < jnp.finfo(length.dtype).eps ** 0.75)
         inaccurate = ~accepted & (solved | memory.inaccurate)
@@ -207,7 +216,7 @@ class _ControlledPlan(AbstractPlan):
     def _error(
         self, model: AbstractModel, a: State, b: State, h: Scalar, at_start: Pair
     ) -> tuple[Scalar, Pair]:
-        """The norm of the error of a step, and the rates at its end."""
+        """The weighted norm of the error of a step, and the rates at its end."""
         at_end = rates(model, b)
         other = other_end(model, a, b, h, (at_start, at_end), self.order)
         join = lambda x: jnp.concatenate([x.q, x.v])
@@ -220,13 +229,13 @@ class _ControlledPlan(AbstractPlan):
 
 
 def _constant(tree: Any) -> Any:
-    """The same without derivatives."""
-    hold = lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x
-    return jax.tree.map(hold, tree)
+    """The tree with derivatives of zero."""
+    stop = lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x
+    return jax.tree.map(stop, tree)
 
 
 def estimate_order(order: int) -> int:
-    """The power of `h` that the estimate of a scheme of this order shrinks with."""
+    """The order in `h` of the error estimate of a scheme of this order."""
     return max(order, 2) + 1 if order <= 4 else order
 
 
@@ -242,6 +251,6 @@ def other_end(
 
     Its own error is `h^(order + 2)` up to order 4, and `h^order` above.
     """
-    nodes = max(order if order <= 4 else order - 2, 3)
-    f = rates_along(model, a, b, h, at_ends, nodes, nodes - 3)
+    num_nodes = max(order if order <= 4 else order - 2, 3)
+    f = rates_along(model, a, b, h, at_ends, num_nodes, num_nodes - 3)
     return end_of(a, h, f, b.t)

@@ -1,8 +1,8 @@
-"""A solve, and where it fails the same step in 2, 4, 8 parts.
+"""A step, which is divided into 2, 4, 8 equal steps if it fails.
 
-In the whip of a chain, or past a singular pose, the equations of a few steps have no
-solution that Newton could find; those of shorter steps have. The laws of the energy hold
-for steps of any length, so nothing is lost but the uniform step.
+When a chain cracks like a whip, or near a singular pose, Newton's method finds no solution
+for some steps, but it does for shorter ones. The energy identity holds for steps of any
+length, so dividing a step costs nothing but its uniform length.
 """
 
 from typing import Any
@@ -21,7 +21,7 @@ from ..schemes import AbstractOneSolveScheme, StepEnd
 from .stage import first_memory, Memory, solve, Solved
 
 
-# Of large systems, whose single steps cost far more than what a second program does.
+# The default for large systems: their steps take far longer than compiling the division.
 _HALVINGS_OF_LARGE_SYSTEMS = 3
 
 
@@ -35,9 +35,10 @@ def solve_or_divide(
     skip: Flag,
     max_halvings: int | None,
 ) -> tuple[Solved, Count]:
-    """A step, whole if it can be, and how often it was halved.
+    """The solved step, and how often it was halved.
 
-    `None` allows three halvings of a large system, none of a small one.
+    By default a step of a large system may be halved three times, and that of a small
+    system not at all.
     """
     whole = solve(scheme, model, start, h, memory, root_finder, skip)
     if max_halvings is None:
@@ -52,52 +53,52 @@ def solve_or_divide(
         failed = (before.result != RESULTS.successful) & ~skip
 
         def again():
-            parts, most = (2**times).astype(h.dtype), 2**max_halvings
-            new = _in_parts(scheme, model, start, h, root_finder, before, parts, most)
-            return _select(failed, (new, times), carry)
+            count, max_count = (2**times).astype(h.dtype), 2**max_halvings
+            new = _divided(scheme, model, start, h, root_finder, before, count, max_count)
+            return select(failed, (new, times), carry)
 
         return jax.lax.cond(in_any_lane(failed), again, lambda: carry), None
 
-    def divided():
+    def all_halvings():
         return jax.lax.scan(halve, (whole, none), jnp.arange(1, max_halvings + 1))[0]
 
-    # Not stored for the reverse pass, but done again there: it is rare.
-    forget = jax.checkpoint_policies.nothing_saveable
+    # The reverse pass repeats a divided step instead of storing it, because it is rare.
+    repeated = jax.checkpoint(all_halvings, policy=jax.checkpoint_policies.nothing_saveable)
     failed = (whole.result != RESULTS.successful) & ~skip
-    # Lanes that take their steps together share the program: it runs if one needs it.
-    return jax.lax.cond(
-        in_any_lane(failed), jax.checkpoint(divided, policy=forget), lambda: (whole, none)
-    )
+    return jax.lax.cond(in_any_lane(failed), repeated, lambda: (whole, none))
 
 
-def _in_parts(
+def _divided(
     scheme: AbstractOneSolveScheme,
     model: AbstractModel,
     start: State,
     h: Scalar,
     root_finder: RootFinder,
     before: Solved,
-    parts: Scalar,
-    most: int,
+    count: Scalar,
+    max_count: int,
 ) -> Solved:
-    """A step that has failed `before`, in `parts` steps, which are at `most` so many."""
-    length = h / parts
+    """A step as `count` equal steps, of which there may be `max_count`.
+
+    `before` is the last attempt, which failed.
+    """
+    length = h / count
 
     def begin(state: State, length: Scalar) -> Memory:
         return first_memory(scheme, model, state, length, *model.accelerations(state))
 
-    def part(sofar: Solved, k: Scalar):
-        unused = (sofar.result != RESULTS.successful) | (k >= parts)
-        state = _timed(sofar.end.state, start, k * length)
+    def one_step(sofar: Solved, k: Scalar):
+        unused = (sofar.result != RESULTS.successful) | (k >= count)
+        state = _at_time(sofar.end.state, start, k * length)
         new = solve(scheme, model, state, length, sofar.memory, root_finder, unused)
-        return _select(unused, sofar, _joined(sofar, new, parts)), None
+        return select(unused, sofar, _joined(sofar, new, count)), None
 
-    none = jax.tree.map(jnp.zeros_like, before.end)
+    zero = jax.tree.map(jnp.zeros_like, before.end)
     nothing = StepEnd(
         state=State(start.q, start.v, before.end.state.t),
-        displacement=none.displacement,
-        multipliers=none.multipliers,
-        energies=none.energies,
+        displacement=zero.displacement,
+        multipliers=zero.multipliers,
+        energies=zero.energies,
         details=before.end.details,
         carried=before.end.carried,
     )
@@ -109,23 +110,23 @@ def _in_parts(
         roughness=before.roughness,
         memory=begin(start, length),
     )
-    done, _ = jax.lax.scan(part, first, jnp.arange(most, dtype=h.dtype))
-    state = _timed(done.end.state, start, h)
+    done, _ = jax.lax.scan(one_step, first, jnp.arange(max_count, dtype=h.dtype))
+    state = _at_time(done.end.state, start, h)
     return eqx.tree_at(lambda done: done.memory, done, begin(state, h))
 
 
-def _timed(state: State, start: State, passed: Scalar) -> State:
+def _at_time(state: State, start: State, passed: Scalar) -> State:
     t = None if start.t is None else start.t + passed
     return State(state.q, state.v, t)
 
 
-def _joined(a: Solved, b: Solved, parts: Scalar) -> Solved:
-    """What one part adds to those before it."""
+def _joined(a: Solved, b: Solved, count: Scalar) -> Solved:
+    """The steps in `a` followed by the step `b`, of `count` in all."""
     end = StepEnd(
         state=b.end.state,
         displacement=a.end.displacement + b.end.displacement,
-        # The mean force over the step.
-        multipliers=a.end.multipliers + b.end.multipliers / parts,
+        # The mean force over the whole step.
+        multipliers=a.end.multipliers + b.end.multipliers / count,
         energies=jax.tree.map(jnp.add, a.end.energies, b.end.energies),
         details=b.end.details,
         result=b.end.result,
@@ -141,5 +142,6 @@ def _joined(a: Solved, b: Solved, parts: Scalar) -> Solved:
     )
 
 
-def _select(choice: Flag, yes: Any, no: Any) -> Any:
+def select(choice: Flag, yes: Any, no: Any) -> Any:
+    """`jnp.where` for trees."""
     return jax.tree.map(lambda a, b: jnp.where(choice, a, b), yes, no)

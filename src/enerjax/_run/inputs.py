@@ -1,7 +1,7 @@
-"""Bad input, told before any step: what is wrong, why that is likely, what to do.
+"""Checks of the arguments of a run, before any step.
 
-Shapes and types are checked always, values where they are known: outside of `jit`, `vmap`
-and `grad`.
+Shapes and types are always checked. Values are checked if they are known, which is outside
+of `jit`, `vmap` and `grad`.
 """
 
 import operator
@@ -15,7 +15,7 @@ from .._programs import is_known
 from .._solvers import RootFinder
 from .._system import (
     AbstractSystem,
-    check_not_mixed,
+    check_not_varying,
     check_number,
     check_system,
     describe,
@@ -35,11 +35,11 @@ def prepare(
     t: Real,
     root_finder: RootFinder,
 ) -> tuple[State, Args, Scalar, Scalar]:
-    """Checked start, `args` of arrays, and `h` and `t` in the dtype of the start."""
+    """The checked start, `args` as arrays, and `h` and `t` in the dtype of the start."""
     if not isinstance(root_finder, RootFinder.__value__):
         raise TypeError(
-            "`root_finder` must be a root finder such as `enerjax.Newton()`, or one of "
-            "optimistix, or a solver of its for least squares, such as "
+            "`root_finder` must be a root finder such as `enerjax.Newton()`, or a root "
+            "finder or least-squares solver of optimistix, such as "
             f"`LevenbergMarquardt(rtol, atol)`; got {root_finder!r}."
         )
     if not isinstance(scheme, AbstractScheme):
@@ -47,14 +47,14 @@ def prepare(
             f"`scheme` must be a scheme such as `EnergyPreserving()`, got {scheme!r}"
             + (": the parentheses are missing." if isinstance(scheme, type) else ".")
         )
-    check_not_mixed((scheme, h))
+    check_not_varying((scheme, h))
     start, args = check_system(system, start, args, t)
     if system.force is not None and min(scheme.stages) < 0:
         raise ValueError(
-            f"`{type(scheme).__name__}` has stages that go backwards in time, and there a "
-            f"damper feeds energy in: {describe('force', system.force)} cannot be used "
-            "with it. Take the scheme that is composed, with a shorter `h`; constraints "
-            "that are `driven` may stay."
+            f"`{type(scheme).__name__}` has stages that go backwards in time, in which a "
+            f"damper would add energy: {describe('force', system.force)} cannot be used "
+            "with it. Use the scheme that it is composed of, with a shorter `h`. "
+            "(`driven` constraints are possible.)"
         )
     if any(jnp.ndim(x) > 0 for x in jax.tree.leaves(scheme)):
         raise ValueError(
@@ -86,12 +86,12 @@ def positive_integer(name: str, count: Any) -> int:
 
 
 def check_halvings(max_halvings: int | None) -> None:
-    """Raises for what is no small number of halvings."""
+    """Raises an error unless this is a small number of halvings, or `None`."""
     if max_halvings is None:
         return
-    whole = isinstance(max_halvings, int) and not isinstance(max_halvings, bool)
-    if not whole or not 0 <= max_halvings <= 20:
+    is_int = isinstance(max_halvings, int) and not isinstance(max_halvings, bool)
+    if not is_int or not 0 <= max_halvings <= 20:
         raise ValueError(
-            "`max_halvings` must be an integer from 0 to 20: a step that fails is tried "
-            f"again in up to `2 ** max_halvings` parts. Got {max_halvings!r}."
+            "`max_halvings` must be an integer from 0 to 20: a failed step is divided into "
+            f"up to `2 ** max_halvings` steps. Got {max_halvings!r}."
         )

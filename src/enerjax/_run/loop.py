@@ -14,6 +14,7 @@ from .._solvers import RootFinder
 from .._system import State
 from .._types import Count, Flag, Multipliers, Scalar
 from ..schemes import AbstractScheme, Energies
+from .halving import select
 from .reverse import keep_roots, loops
 from .saving import Begin, Costs, Record, with_time
 from .step import advance, first_warm, Warm
@@ -21,10 +22,7 @@ from .step_sizes import AbstractPlan
 
 
 class Progress(eqx.Module):
-    """How far a run has come: what one step hands to the next.
-
-    Once a step has failed it is the last good state.
-    """
+    """The carry of the loop over the steps; after a failure, that of the last good step."""
 
     state: State
     warm: Warm
@@ -36,7 +34,7 @@ class Progress(eqx.Module):
 
 
 class Stepper(eqx.Module):
-    """Everything that a step needs and no step changes."""
+    """What all steps of a run have in common."""
 
     scheme: AbstractScheme
     model: AbstractModel
@@ -45,7 +43,7 @@ class Stepper(eqx.Module):
     max_halvings: int | None = eqx.field(static=True)
 
     def begin(self, start: State) -> Progress:
-        """A run that begins at `start`, a state of the model."""
+        """The carry at the start of a run; `start` is a state of the model."""
         scheme, model, plan = self.scheme, self.model, self.plan
         acceleration, multipliers = model.accelerations(start)
         h = plan.unit * plan.first()
@@ -62,10 +60,10 @@ class Stepper(eqx.Module):
         )
 
     def attempt(self, before: Progress, live: Flag) -> tuple[Progress, "_Attempt"]:
-        """Tries one step; where `live` is false nothing changes, and it costs nothing."""
+        """Attempts one step. If `live` is false nothing changes, at no cost."""
         model, plan = self.model, self.plan
         place, length = plan.next(before.memory, before.place)
-        # A step that is not made has a length all the same: its derivatives are numbers.
+        # A step that is not live gets a positive length, so that no derivative is NaN.
         length = jnp.where(live, length, plan.first())
         begin = with_time(model, plan, before.state, before.place)
         out = advance(
@@ -81,12 +79,12 @@ class Stepper(eqx.Module):
         verdict = plan.judge(before.memory, model, begin, out, length)
         good = live & verdict.accepted
         result = RESULTS.where(live, verdict.result, RESULTS.successful)
-        keep = lambda new, old: _select(good, new, old)
+        keep = lambda new, old: select(good, new, old)
         after = Progress(
             state=keep(State(out.state.q, out.state.v), before.state),
             warm=keep(plan.kept(out.warm, before.warm), before.warm),
             place=keep(place, before.place),
-            memory=_select(live, verdict.memory, before.memory),
+            memory=select(live, verdict.memory, before.memory),
             result=first_failure(before.result, result),
             completed=before.completed + good.astype(before.completed.dtype),
             multipliers=keep(out.multipliers, before.multipliers),
@@ -106,7 +104,7 @@ class Stepper(eqx.Module):
 
 
 class _Attempt(eqx.Module):
-    """What is told of one step that was tried; energies are zero for a rejected one."""
+    """The report of one attempted step; the energies of a rejected one are zero."""
 
     energies: Energies
     details: PyTree[Any]
@@ -120,9 +118,9 @@ def run_loop(
     steps_in_group: int,
     keep: Callable[[State, Scalar], PyTree[Any]],
 ) -> tuple[Begin, Progress, Record]:
-    """All steps of a run, in groups of so many attempts.
+    """Runs all steps, in groups of `steps_in_group` attempts.
 
-    `keep(state, place)` is what is kept of the state after each group.
+    `keep(state, place)` is kept of the state after each group.
     """
     plan = stepper.plan
     num_groups = -(-plan.max_attempts // steps_in_group)
@@ -164,29 +162,23 @@ def run_loop(
     return kept, eqx.tree_at(lambda x: x.result, end, result), record
 
 
-def _select(good: Flag, new: PyTree[Any], old: PyTree[Any]) -> PyTree[Any]:
-    return jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)
-
-
 def _check_start(
     scheme: AbstractScheme, model: AbstractModel, start: State, h: Scalar
 ) -> RESULTS:
-    """Whether the start satisfies what the scheme holds, to half the digits of a step.
+    """Whether the start satisfies the constraints of the scheme, to half the digits.
 
-    An error there would stay in the energy balance of the first step. The measure is
-    the motion or velocity that would repair it, against those of a step, wherever the
-    origin lies.
+    An error would stay in the energy balance of the first step. The displacement or
+    velocity that would repair it is compared with that of a step, so the position of the
+    origin does not matter.
     """
-    scales = model.scales
+    scales, eps = model.scales, jnp.finfo(h.dtype).eps
     root = jnp.sqrt(model.energy_scale(start, h))
-    # NaN compares false: a start that cannot be measured fails at its first step.
-    tolerance = jnp.sqrt(jnp.finfo(h.dtype).eps)
+    # NaN compares false: such a start fails in its first step.
+    tolerance = 1e2 * jnp.sqrt(eps) * root
     position = jnp.abs(model.constraint(start.q, start.t))
-    rounding = 1e3 * jnp.finfo(h.dtype).eps * scales.constraint_size
-    far = position > 1e2 * tolerance * h * root * scales.constraint + rounding
-    bad = jnp.any(far)
+    rounding = 1e3 * eps * scales.constraint_size
+    bad = jnp.any(position > h * tolerance * scales.constraint + rounding)
     if scheme.stage.formulation == "ggl":
         rate = jnp.abs(model.joint_rate(start.q, start.v, start.t))
-        fast = rate > 1e2 * tolerance * root * scales.constraint[: rate.size]
-        bad = bad | jnp.any(fast)
+        bad = bad | jnp.any(rate > tolerance * scales.constraint[: rate.size])
     return RESULTS.where(bad, RESULTS.inconsistent_start, RESULTS.successful)

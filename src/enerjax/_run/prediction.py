@@ -1,4 +1,4 @@
-"""What steps of other lengths leave for the next: the guess that Newton begins from."""
+"""Initial guesses of Newton's method after steps of other lengths."""
 
 import equinox as eqx
 import jax
@@ -13,14 +13,16 @@ from .step import Warm
 def for_length(
     warm: Warm, stages: tuple[float, ...], before: Float[Array, "3"], length: Scalar
 ) -> Warm:
-    """The memory of steps of the lengths `before`, newest first, as one of equal steps.
+    """Converts the memory of steps with the lengths `before`, newest first, to steps of
+    the length `length`.
 
-    What a step adds to a free flight grows like its length, so the quotient of both is
-    extrapolated, over the distances between the middles of the steps. `solve` itself
-    extrapolates `3 x0 - 3 x1 + x2`, or repeats `x0`: entries that make it find both.
+    What a step adds to a free flight is proportional to its length, so their quotient is
+    extrapolated quadratically from the midpoints of the three steps. `solve` extrapolates
+    `3 x0 - 3 x1 + x2`, or repeats `x0`: the entries are chosen such that it finds the
+    extrapolated value, or the last one.
     """
     ends = np.cumsum(stages)
-    # Of a backward stage the middle may lie outside of the step; distances stay positive.
+    # The midpoint of a backward stage may lie outside of the step, hence the clipping.
     middle = jnp.asarray(np.clip(ends - 0.5 * np.asarray(stages), 0, 1), length.dtype)
     a, b, c = before
     first = (1 - middle) * a + middle * length
@@ -44,7 +46,7 @@ def for_length(
 
 
 def with_history(new: Warm, old: Warm) -> Warm:
-    """`new`, whose last step is as it was, and those before as they are in `old`."""
+    """The last step of `new`, and before it the steps of `old`."""
     join = lambda x, y: jnp.concatenate([x[:, :1], y[:, :2]], axis=1)
     added = jax.tree.map(join, new.stages.added, old.stages.added)
     return eqx.tree_at(lambda warm: warm.stages.added, new, added)

@@ -1,9 +1,9 @@
-"""Which numbers of a run are kept for the reverse pass, and which are computed again.
+"""Which numbers of a run are kept for the reverse pass, and which are recomputed.
 
-A step is computed again from the state before it and its root, without a search. Runs are
-cut into segments of about the square root of their steps: the states within a segment are
-computed again from its start and its roots. Long runs keep the starts of segments alone,
-and search for the roots once more: the memory grows like the square root of the steps.
+A step is recomputed from the state before it and its root, without Newton's method. A run
+of `n` steps is divided into segments of about `sqrt(n)` steps, whose states are recomputed
+from the start of the segment and the roots. Long runs keep only the starts of the segments
+and repeat Newton's method, so that their memory grows like `sqrt(n)`.
 """
 
 import functools
@@ -20,15 +20,15 @@ from .._solvers import ROOT
 from .._types import Flag
 
 
-# Steps beyond which the roots are not kept.
+# With more steps than this the roots are not kept.
 LONG = 10_000
 
 Body: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]
-# `scan(body, carry, count, live)` calls `body(carry, live)` so many times.
+# `scan(body, carry, count, live)` calls `body(carry, live)` `count` times.
 Scan: TypeAlias = Callable[[Body, Any, int, Flag], tuple[Any, Any]]
 
 
-# In a loop nothing is merged with what a pass before computed.
+# XLA cannot merge a recomputation with the original across the passes of a loop.
 _checkpoint = functools.partial(jax.checkpoint, prevent_cse=False)
 
 
@@ -42,12 +42,12 @@ def loops(
 ) -> tuple[Scan, Scan]:
     """The loops over the groups of steps of a run, and over the steps of a group.
 
-    Segments that begin after `done(carry)` cost nothing, and what they hand out is zero; of
-    a batch the last lane decides. `None` where all of them are needed.
+    A segment that begins after `done(carry)` is skipped, and its outputs are zero; in a
+    batch it is skipped when all lanes are done. `None` if all segments are needed.
     """
     total = groups * steps
     length = math.isqrt(total)
-    # One of both loops is cut: a segment consists of whole groups, or is a part of one.
+    # One of the loops is divided: a segment consists of whole groups, or is part of one.
     if steps > length:
         return _scan, functools.partial(_in_segments, total, length, done=done)
     in_segments = functools.partial(_in_segments, total, length // steps, done=done)
@@ -67,22 +67,22 @@ def _in_segments(
     live: Flag,
     done: Callable[[Any], Array] | None = None,
 ) -> tuple[Any, Any]:
-    """A scan cut into segments of about `length` turns, in a run of `total` steps.
+    """A scan divided into segments of about `length` passes, in a run of `total` steps.
 
-    If the segments hold more turns than `count`, the last turns are not live. A segment of
-    a small system is one function of machine code.
+    The passes of the last segment that exceed `count` are not live. A segment of a small
+    system is one function of machine code.
     """
     sizes = range((length + 1) // 2, 2 * length + 1)
     size = min(sizes, key=lambda size: -count % size)
 
-    # Which turns are live is found within a segment: as an array for all turns it would
-    # take more memory than the reverse pass of a long run keeps.
-    def turns(carry: Any, given: tuple[Array, Flag]) -> tuple[Any, Any]:
-        first, live = given
-        turn = lambda carry, k: body(carry, live & (first + k < count))
-        return jax.lax.scan(turn, carry, jnp.arange(size))
+    # Whether a pass is live is computed within its segment. An array of flags for all
+    # passes would take more memory than the reverse pass of a long run keeps.
+    def passes(carry: Any, inputs: tuple[Array, Flag]) -> tuple[Any, Any]:
+        first, live = inputs
+        one_pass = lambda carry, k: body(carry, live & (first + k < count))
+        return jax.lax.scan(one_pass, carry, jnp.arange(size))
 
-    segment = in_one_function(keep_roots(turns))
+    segment = in_one_function(keep_roots(passes))
     if total > LONG:
         segment = _checkpoint(segment)
     if done is not None:
@@ -94,11 +94,11 @@ def _in_segments(
 
 
 def _unless(done: Callable[[Any], Array], segment: Body) -> Body:
-    """`segment`, passed over where it would change nothing."""
+    """`segment`, which is skipped if it would change nothing."""
 
-    def idle(carry: Any, given: Any) -> tuple[Any, Any]:
-        _, out = jax.eval_shape(segment, carry, given)
+    def skipped(carry: Any, inputs: Any) -> tuple[Any, Any]:
+        _, out = jax.eval_shape(segment, carry, inputs)
         return carry, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), out)
 
     skip = lambda carry: ~in_any_lane(~done(carry))
-    return lambda carry, given: jax.lax.cond(skip(carry), idle, segment, carry, given)
+    return lambda carry, inputs: jax.lax.cond(skip(carry), skipped, segment, carry, inputs)

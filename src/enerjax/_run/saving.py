@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -16,7 +16,7 @@ from .._programs import is_known
 from .._system import State
 from .._types import Args, Count, Multipliers, Scalar, Times, Vector
 from ..schemes import Energies
-from .dense_output import Bracket, state_within
+from .collocation import state_within
 from .inputs import positive_integer
 from .step_sizes import AbstractController, AbstractPlan, EqualSteps
 
@@ -25,27 +25,26 @@ SaveFunction = TypeAliasType("SaveFunction", Callable[[Scalar, State, Args], PyT
 
 
 class SaveAt(eqx.Module):
-    """Which states of a run are saved. Give at most one of `every`, `ts` and `t1`.
+    """Which states of a run are saved. Pass at most one of `every`, `ts` and `t1`.
 
-    Without any of them a run of `num_steps` saves every step, and a run to a time its
+    By default a run of `num_steps` saves every step, and a run to a time `t1` saves its
     start and its end.
 
     **Arguments:**
 
-    - `every`: the start, every `every`-th step, and the end. Where the number of steps is
-      known only to be at most `max_steps`, there is room for that many, and rows that are
-      left over are NaN.
-    - `ts`: at these times, shape `(times,)`, ascending, from the start to the end of the
-      run. Within a step the state is interpolated to the order of the scheme and moved
-      onto the constraints; at its end it is the state itself. Memory grows with the number
-      of steps.
-    - `t1`: the start and the end.
-    - `fn`: a function `fn(t, state, args)`; what it returns, a pytree of arrays, is saved
-      as `Solution.ys` in place of the state. Of a long run of a large system it keeps
-      what is of interest alone.
+    - `every`: save the start, every `every`-th step, and the end. If only a bound
+      `max_steps` on the number of steps is known, there are rows for that many steps, and
+      those that are not needed are NaN.
+    - `ts`: save the states at these times, shape `(times,)`, ascending, within the run.
+      Within a step the state is interpolated to the order of the scheme and projected onto
+      the constraints. Memory grows with the number of steps.
+    - `t1`: save the start and the end.
+    - `fn`: a function `fn(t, state, args)` whose value, a pytree of arrays, is saved as
+      `Solution.ys` in place of the state. In long runs of large systems it can keep only
+      what is of interest.
 
     **Raises:** `ValueError` or `TypeError` for more than one choice, for an `every` that is
-    no positive integer, and for an `fn` that is no function.
+    not a positive integer, and for an `fn` that is not a function.
     """
 
     every: int | None = eqx.field(static=True, default=None)
@@ -54,20 +53,20 @@ class SaveAt(eqx.Module):
     fn: SaveFunction | None = None
 
     def __check_init__(self):
-        given = [name for name in ("every", "ts") if getattr(self, name) is not None]
-        given += ["t1"] if self.t1 else []
-        if len(given) > 1:
+        chosen = [name for name in ("every", "ts") if getattr(self, name) is not None]
+        chosen += ["t1"] if self.t1 else []
+        if len(chosen) > 1:
             raise ValueError(
                 "`SaveAt` takes one of `every`, `ts` and `t1`, got "
-                + " and ".join(f"`{name}`" for name in given)
-                + ". (The end of a run is always in the rows of `every`.)"
+                + " and ".join(f"`{name}`" for name in chosen)
+                + ". (The rows of `every` always include the end of a run.)"
             )
         if self.every is not None:
             positive_integer("every", self.every)
         if not isinstance(self.t1, bool):
             raise TypeError(
                 f"`SaveAt(t1=True)` saves the start and the end, got t1 = {self.t1!r}. "
-                "Times are given as `SaveAt(ts=...)`."
+                "Pass times as `SaveAt(ts=...)`."
             )
         if self.fn is not None and not callable(self.fn):
             raise TypeError(
@@ -96,7 +95,7 @@ def _as_times(ts: Vector, plan: AbstractPlan) -> Times:
 
 
 class Costs(eqx.Module):
-    """What steps cost; see `Statistics`."""
+    """The costs of steps; see `Statistics`."""
 
     iterations: Array
     residual: Array
@@ -104,7 +103,7 @@ class Costs(eqx.Module):
     local_error: Array
 
     def total(self) -> "Costs":
-        """Of all steps along the leading axis together."""
+        """The costs of all steps along the leading axis together."""
         return Costs(
             iterations=jnp.sum(self.iterations, axis=0),
             residual=jnp.max(self.residual, axis=0),
@@ -113,7 +112,7 @@ class Costs(eqx.Module):
         )
 
     def by_segment(self, segment: Int[Array, " steps"], num_segments: int) -> "Costs":
-        """Of the steps of each segment together."""
+        """The costs of the steps of each segment together."""
         add = lambda x: jax.ops.segment_sum(x, segment, num_segments)
         largest = lambda x: jnp.maximum(jax.ops.segment_max(x, segment, num_segments), 0)
         return Costs(
@@ -125,13 +124,15 @@ class Costs(eqx.Module):
 
 
 class Record(eqx.Module):
-    """What the loop leaves, with a leading axis of groups of attempted steps.
+    """What the loop returns for each group of attempted steps, along a leading axis.
 
-    - `kept`: of the state after the group, and `multipliers` of its last step.
-    - `details`: what the scheme reports of its own, of the last accepted step.
-    - `energies`, `costs`: of the group together; energies of accepted steps alone.
-    - `place`: of the run after the group, see `AbstractPlan`.
-    - `reached`: whether the group led on, and did not fail.
+    - `kept`: what is kept of the state after the group.
+    - `multipliers`: of the last step.
+    - `details`: what the scheme reports of the last accepted step.
+    - `energies`: sums over the accepted steps.
+    - `costs`: of all attempted steps together.
+    - `place`: how far the run has come, see `AbstractPlan`.
+    - `reached`: whether a step of the group was accepted, and none failed.
     """
 
     kept: PyTree[Any]
@@ -144,14 +145,28 @@ class Record(eqx.Module):
 
 
 class Begin(eqx.Module):
-    """The start of a run: what is kept of the state, and the multipliers there."""
+    """What is kept of the start of a run, and the multipliers there."""
 
     kept: PyTree[Any]
     multipliers: Multipliers
 
 
+class RecordedRun(eqx.Module):
+    """A run whose rows are still to be made: all that the loop has returned.
+
+    `completed` steps were accepted; `order` is that of the scheme.
+    """
+
+    model: AbstractModel
+    plan: AbstractPlan
+    begin: Begin
+    record: Record
+    completed: Count
+    order: int = eqx.field(static=True)
+
+
 class Rows(eqx.Module):
-    """The rows of a solution; `kept` are states, or what a function made of them."""
+    """The rows of a solution; `kept` are states, or the values of `SaveAt(fn=...)`."""
 
     ts: Times
     kept: PyTree[Any]
@@ -162,35 +177,25 @@ class Rows(eqx.Module):
 
 
 class AbstractSaving(eqx.Module):
-    """How rows are made: how many steps the loop takes between two states that it keeps,
-    and which rows follow from these."""
+    """How rows are made from the states that the loop keeps.
+
+    `keeps_rows` tells whether these states are the rows.
+    """
+
+    keeps_rows: ClassVar[bool]
 
     @abc.abstractmethod
     def steps_in_group(self, plan: AbstractPlan) -> int:
-        """Attempted steps between two states that are kept."""
-
-    @property
-    @abc.abstractmethod
-    def keeps_rows(self) -> bool:
-        """Whether the states that the loop keeps are the rows."""
+        """The number of attempted steps between two states that are kept."""
 
     @abc.abstractmethod
-    def rows(
-        self,
-        model: AbstractModel,
-        plan: AbstractPlan,
-        begin: Begin,
-        record: Record,
-        completed: Count,
-        order: int,
-    ) -> Rows:
-        """The rows, NaN where the run did not come so far."""
+    def rows(self, run: RecordedRun) -> Rows:
+        """The rows; those that the run did not reach are NaN."""
 
 
 def saving_of(
     saveat: SaveAt, plan: AbstractPlan, controller: AbstractController
 ) -> AbstractSaving:
-    """How the rows of a run are made."""
     if saveat.ts is not None:
         return _AtTimes(_as_times(saveat.ts, plan))
     if saveat.t1 or (saveat.every is None and not plan.is_counted):
@@ -202,121 +207,76 @@ def saving_of(
 
 
 class _AtBothEnds(AbstractSaving):
-    """Two rows."""
+    """The start and the end."""
+
+    keeps_rows = True
 
     def steps_in_group(self, plan: AbstractPlan) -> int:
         return plan.max_attempts
 
-    @property
-    def keeps_rows(self) -> bool:
-        return True
-
-    def rows(
-        self,
-        model: AbstractModel,
-        plan: AbstractPlan,
-        begin: Begin,
-        record: Record,
-        completed: Count,
-        order: int,
-    ) -> Rows:
+    def rows(self, run: RecordedRun) -> Rows:
+        plan, record = run.plan, run.record
         at_end = record.reached & (record.place >= plan.last)
-        return _after_start(begin, record, at_end, jnp.stack([plan.t0, plan.t1]))
+        return _after_start(run.begin, record, at_end, jnp.stack([plan.t0, plan.t1]))
 
 
 class _EveryEqualStep(AbstractSaving):
-    """The start, every so many steps of one length, and the end."""
+    """The start, every `every`-th of the equal steps, and the end."""
 
+    keeps_rows = True
     every: int = eqx.field(static=True)
 
     def steps_in_group(self, plan: AbstractPlan) -> int:
         return self.every
 
-    @property
-    def keeps_rows(self) -> bool:
-        return True
-
-    def rows(
-        self,
-        model: AbstractModel,
-        plan: AbstractPlan,
-        begin: Begin,
-        record: Record,
-        completed: Count,
-        order: int,
-    ) -> Rows:
-        # Of a run that fails the times are those that were planned.
+    def rows(self, run: RecordedRun) -> Rows:
+        plan, record = run.plan, run.record
+        # A run that fails still reports the times that were planned.
         numbers = self.every * jnp.arange(record.reached.size + 1, dtype=plan.last.dtype)
         is_used = numbers - self.every < plan.last
         ts = jnp.where(is_used, jax.vmap(plan.time)(numbers), jnp.nan)
-        return _after_start(begin, record, record.reached, ts)
+        return _after_start(run.begin, record, record.reached, ts)
 
 
 class _EveryAcceptedStep(AbstractSaving):
-    """The start, every so many accepted steps, and the end."""
+    """The start, every `every`-th accepted step, and the end."""
 
+    keeps_rows = False
     every: int = eqx.field(static=True)
 
     def steps_in_group(self, plan: AbstractPlan) -> int:
         return 1
 
-    @property
-    def keeps_rows(self) -> bool:
-        return False
-
-    def rows(
-        self,
-        model: AbstractModel,
-        plan: AbstractPlan,
-        begin: Begin,
-        record: Record,
-        completed: Count,
-        order: int,
-    ) -> Rows:
+    def rows(self, run: RecordedRun) -> Rows:
+        plan, record, completed = run.plan, run.record, run.completed
         num_rows = -(-record.reached.size // self.every)
-        accepted = _accepted(record)
         last = jnp.minimum(self.every * jnp.arange(1, num_rows + 1), completed) - 1
         is_used = self.every * jnp.arange(num_rows) < completed
-        picked = jax.tree.map(lambda x: x[last], accepted)
+        picked = jax.tree.map(lambda x: x[last], _accepted_first(record))
         segment = jnp.minimum(_number_of_step(record) // self.every, num_rows - 1)
-        kept = eqx.tree_at(
-            lambda x: (x.energies, x.costs),
-            picked,
-            (
-                _energies_by_segment(record.energies, segment, num_rows),
-                record.costs.by_segment(segment, num_rows),
-            ),
-        )
-        times = jax.vmap(plan.time)(kept.place)
+        energies = _energies_by_segment(record.energies, segment, num_rows)
+        costs = record.costs.by_segment(segment, num_rows)
+        picked = eqx.tree_at(lambda x: (x.energies, x.costs), picked, (energies, costs))
+        times = jax.vmap(plan.time)(picked.place)
         ts = jnp.append(plan.t0, jnp.where(is_used, times, jnp.nan))
-        return _after_start(begin, kept, is_used, ts)
+        return _after_start(run.begin, picked, is_used, ts)
 
 
 class _AtTimes(AbstractSaving):
-    """At requested times, which ascend. Those at the end of a step are its end.
+    """Requested times, which ascend. A row at the end of a step is the end of that step.
 
     The energies are those of the steps that have ended since the row before.
     """
 
+    keeps_rows = False
     times: Times
 
     def steps_in_group(self, plan: AbstractPlan) -> int:
         return 1
 
-    @property
-    def keeps_rows(self) -> bool:
-        return False
-
-    def rows(
-        self,
-        model: AbstractModel,
-        plan: AbstractPlan,
-        begin: Begin,
-        record: Record,
-        completed: Count,
-        order: int,
-    ) -> Rows:
-        steps, ts, num = _accepted(record), self.times, self.times.size
+    def rows(self, run: RecordedRun) -> Rows:
+        plan, record, completed, ts = run.plan, run.record, run.completed, self.times
+        steps = _accepted_first(record)
         ends = jnp.where(jnp.arange(record.reached.size) < completed, steps.place, jnp.inf)
         places = (ts - plan.t0) / plan.unit
         # The round-off of the times and of their differences.
@@ -332,49 +292,45 @@ class _AtTimes(AbstractSaving):
         at_end = jnp.abs(places - last) <= near
         part = jnp.where(at_end, 1.0, (places - first) / (last - first))
         part = jnp.where(at_start | ~inside, 0.0, part)
-        states = _states_within(
-            model, plan, begin, steps.kept, order, (number, first, last, part)
-        )
+        states = _states_within(run, steps.kept, (number, first, last, part))
         done = jnp.where(part == 1, number + 1, number)
         segment = jnp.searchsorted(done, _number_of_step(record), side="right")
         valid = inside | at_start
         details = jax.tree.map(lambda x: x[number], steps.details)
         multipliers = _nan_unless(valid, steps.multipliers[number])
-        energies = _energies_by_segment(record.energies, segment, num)
+        energies = _energies_by_segment(record.energies, segment, ts.size)
+        at_start = at_start[:, None]
         return Rows(
             ts=ts,
             kept=_nan_unless(valid, states),
-            multipliers=jnp.where(at_start[:, None], begin.multipliers[None], multipliers),
+            multipliers=jnp.where(at_start, run.begin.multipliers[None], multipliers),
             details=jax.tree.map(lambda x: x[1:], _nan_unless(valid, details)),
             energies=_nan_unless(valid, energies),
-            costs=record.costs.by_segment(segment, num),
+            costs=record.costs.by_segment(segment, ts.size),
         )
 
 
 def _states_within(
-    model: AbstractModel,
-    plan: AbstractPlan,
-    begin: Begin,
-    ends: State,
-    order: int,
-    rows: tuple[Count, Scalar, Scalar, Scalar],
+    run: RecordedRun, ends: State, rows: tuple[Count, Scalar, Scalar, Scalar]
 ) -> State:
-    """States at parts of steps: the number of each step, its two places, and the part."""
-    starts = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), begin.kept, ends)
+    """The states at rows that lie within steps.
+
+    A row is the number of its step, the places where this step begins and ends, and the
+    fraction of the step at which the row lies.
+    """
+    model, plan = run.model, run.plan
+    join = lambda x, y: jnp.concatenate([x[None], y])
+    starts = jax.tree.map(join, run.begin.kept, ends)
 
     def state_at(row: tuple[Count, Scalar, Scalar, Scalar]) -> State:
         number, first, last, part = row
         pick = lambda tree: jax.tree.map(lambda x: x[number], tree)
         a = pick(starts)
-        # A row that is not reached is no step: its derivatives are numbers all the same.
+        # A row that is not reached has no step; its derivatives must still be finite.
         b = jax.tree.map(lambda x, y: jnp.where(part > 0, x, y), pick(ends), a)
-        bracket = Bracket(
-            start=with_time(model, plan, a, first),
-            end=with_time(model, plan, b, last),
-            h=plan.unit * (last - first),
-            part=part,
-        )
-        state = state_within(model, bracket, order)
+        begin, end = with_time(model, plan, a, first), with_time(model, plan, b, last)
+        h = plan.unit * (last - first)
+        state = state_within(model, begin, end, h, part, run.order)
         return State(state.q, state.v)
 
     return jax.lax.map(state_at, rows)
@@ -383,13 +339,13 @@ def _states_within(
 def with_time(
     model: AbstractModel, plan: AbstractPlan, state: State, place: Scalar
 ) -> State:
-    """A state with its time, where time enters."""
+    """The state with its time, if the system depends on time."""
     t = plan.time(place) if model.system.is_timed else None
     return State(state.q, state.v, t)
 
 
-def _accepted(record: Record) -> Record:
-    """The steps that were accepted, first; those behind them have no meaning."""
+def _accepted_first(record: Record) -> Record:
+    """The accepted steps at the beginning; the entries after them are meaningless."""
     numbers = jnp.arange(record.reached.size)
     order = jnp.searchsorted(jnp.cumsum(record.reached), numbers + 1)
     order = jnp.minimum(order, numbers.size - 1)
@@ -397,7 +353,10 @@ def _accepted(record: Record) -> Record:
 
 
 def _number_of_step(record: Record) -> Int[Array, " groups"]:
-    """Which accepted step each attempt belongs to: a rejected one to the next accepted."""
+    """The number of the accepted step that each attempt belongs to.
+
+    A rejected attempt belongs to the next accepted step.
+    """
     reached = record.reached.astype(int)
     return jnp.cumsum(reached) - reached
 
@@ -411,7 +370,7 @@ def _energies_by_segment(
 def _after_start(
     begin: Begin, record: Record, valid: Bool[Array, " groups"], ts: Times
 ) -> Rows:
-    """The start, and the groups behind it."""
+    """The rows of the start and of the groups."""
     kept, multipliers, details, energies = _nan_unless(
         valid, (record.kept, record.multipliers, record.details, record.energies)
     )

@@ -13,10 +13,10 @@ from .._system import AbstractSystem, State
 from .._types import Args, Real, Scalar
 from ..schemes import AbstractScheme
 from .audit import audit, Measures, measures
-from .failure import memory_told, raise_failure
+from .failure import explained_memory_error, raise_failure
 from .inputs import check_halvings, prepare
 from .loop import run_loop, Stepper
-from .saving import AbstractSaving, SaveAt, SaveFunction, saving_of
+from .saving import AbstractSaving, RecordedRun, SaveAt, SaveFunction, saving_of
 from .solution import Solution, Statistics
 from .step_sizes import AbstractController, AbstractPlan, EqualSteps, find_end
 
@@ -43,40 +43,41 @@ def simulate(
     `h`, the numbers of the scheme (`alpha`), `start` and all inexact leaves of `args` are
     traced: new values never recompile, and `vmap`, `grad`, `jvp` and `jit` work over each.
     Write a number that you want to change as `1.0`, not `1`: Python integers are part
-    of the program. For derivatives with respect to the start, make the start inside the
+    of the program. For derivatives with respect to the start, create the start inside the
     differentiated function with `initial_state`, so that it stays on the constraints.
 
     **Arguments:**
 
-    - `system`: what moves; see `System`.
-    - `scheme`: how; see the schemes. There is no default: it is part of the model.
-    - `start`: a `State` that satisfies the constraints, as `initial_state` makes it.
-    - `args`: any pytree, handed to the functions of the system.
+    - `system`: the mechanical system; see `System`.
+    - `scheme`: the integration scheme, such as `EnergyConsistent(0.5)`. There is no
+      default, because the choice is part of the model.
+    - `start`: a `State` that satisfies the constraints, such as that of `initial_state`.
+    - `args`: any pytree, which is passed to the functions of the system.
     - `h`: length of a step (time), positive.
-    - `num_steps`: how many steps of the length `h` the run has.
-    - `t1`: instead of this, the time of the end, traced. The number of steps is
-      `(t1 - t0)/h`, rounded up but for round-off, and `h` is shortened to fit: lanes of
-      different `h` end at the same time, in one program.
+    - `num_steps`: the number of steps.
+    - `t1`: the time of the end, in place of `num_steps`; traced. The number of steps is
+      `(t1 - t0)/h`, rounded up except for round-off, and `h` is shortened to fit: lanes
+      with different `h` end at the same time, in one program.
     - `t0`: the time of the start; step `k` begins at `t0 + k h`. Traced.
     - `saveat`: which states become the rows of the solution; see `SaveAt`. In reverse mode
-      the solved unknowns of each step are stored too, up to 10^4 steps; beyond, memory
-      grows like the square root of the steps, at the cost of one more run.
+      the solved unknowns of each step are stored too, up to 10^4 steps. Beyond, memory
+      grows like the square root of the number of steps, at the cost of one more run.
     - `controller`: `EqualSteps()`, or with `t1` a `StepController(rtol, atol)` that varies
-      the steps; `h` is the first. Derivatives are those of the steps as they were chosen,
-      as parts of `t1 - t0`.
-    - `max_steps`: with `t1`, a bound on the steps, rejected ones included; a run that
-      needs more fails. Without it the number of steps where it is known, and with a
-      controller 4096. Steps that are left cost nothing; of a batch those after its last
-      lane.
-    - `root_finder`: for the step equations, which are scaled to order one (so tolerances
-      are relative); one of optimistix can be given, or a solver of its for least squares.
-    - `max_halvings`: a step that fails is tried again in 2, 4, up to `2 ** max_halvings`
-      equal parts, in which the laws of the energy hold as in a whole one; 0 for never.
-      Where it is not given: 3 for systems of many unknowns, else 0, for it makes the
-      program longer. `stats.halvings` tells where it was needed.
-    - `throw`: raise an error at the end of a run that failed, which names the step, the
-      time and the cause (under `jit`, `vmap` and `grad` the cause alone, and for all
-      lanes together). With `False` look at `result`: rows after the failure are NaN.
+      the length of the steps, of which `h` is the first. Derivatives treat the chosen
+      lengths as constant fractions of `t1 - t0`.
+    - `max_steps`: with `t1`, a bound on the number of steps, including rejected ones; a run
+      that needs more fails. The default is the number of steps if that is known, and 4096
+      with a controller. Unused steps cost nothing; a batch ends with its last lane.
+    - `root_finder`: solves the step equations, which are scaled to order one, so that
+      tolerances are relative. Root finders and least-squares solvers of optimistix can be
+      used too.
+    - `max_halvings`: a failed step is repeated as 2, 4, up to `2 ** max_halvings` equal
+      steps, for which the energy identity holds as well; 0 disables this. The default is 3
+      for systems with many unknowns, else 0, because it lengthens the compilation.
+      `stats.halvings` shows where steps were divided.
+    - `throw`: raise an error at the end of a failed run, which names the step, the time and
+      the cause (under `jit`, `vmap` and `grad` only the cause, and for all lanes at once).
+      With `False` check `result`: rows after the failure are NaN.
 
     **Returns:** a `Solution`.
 
@@ -100,7 +101,7 @@ def simulate(
         root_finder=root_finder,
         max_halvings=max_halvings,
     )
-    with memory_told(plan.max_attempts):
+    with explained_memory_error(plan.max_attempts):
         solution, reached = _run(task)
     if not throw:
         return solution
@@ -109,7 +110,7 @@ def simulate(
 
 
 class _Task(eqx.Module):
-    """A run, checked: the arguments of `simulate`."""
+    """The checked arguments of `simulate`."""
 
     system: AbstractSystem
     scheme: AbstractScheme
@@ -129,19 +130,19 @@ def _run(task: _Task) -> tuple[Solution, Scalar]:
     model = make_model(task.system, task.start, task.args)
 
     def observe(state: State, t: Scalar) -> tuple[PyTree[Any], Measures]:
-        """What users are given of a state, and what the audit tells of it."""
-        told: PyTree[Any] = model.to_user(state)
+        """The user's form of a state, or the value of `fn`, and its part of the audit."""
+        value: PyTree[Any] = model.to_user(state)
         if fn is not None:
-            told = jax.tree.map(jnp.asarray, fn(t, told, task.args))
+            value = jax.tree.map(jnp.asarray, fn(t, value, task.args))
         timed = State(state.q, state.v, t if task.system.is_timed else None)
-        return told, measures(model, timed)
+        return value, measures(model, timed)
 
-    # A function of the state is evaluated in the loop, so that no states are stored;
-    # without one all rows are judged together after the loop, which is faster.
-    at_once = fn is not None and saving.keeps_rows
+    # With `fn` states are observed in the loop, so that they need not be stored. Otherwise
+    # they are observed together after the loop, which is faster.
+    in_loop = fn is not None and saving.keeps_rows
 
     def keep(state: State, place: Scalar) -> PyTree[Any]:
-        return observe(state, plan.time(place)) if at_once else state
+        return observe(state, plan.time(place)) if in_loop else state
 
     stepper = Stepper(
         scheme=task.scheme,
@@ -152,14 +153,22 @@ def _run(task: _Task) -> tuple[Solution, Scalar]:
     )
     start = model.to_internal(task.start)
     begin, end, record = run_loop(stepper, start, saving.steps_in_group(plan), keep)
-    rows = saving.rows(model, plan, begin, record, end.completed, task.scheme.order)
-    ys, told = rows.kept if at_once else jax.vmap(observe)(rows.kept, rows.ts)
+    run = RecordedRun(
+        model=model,
+        plan=plan,
+        begin=begin,
+        record=record,
+        completed=end.completed,
+        order=task.scheme.order,
+    )
+    rows = saving.rows(run)
+    ys, measured = rows.kept if in_loop else jax.vmap(observe)(rows.kept, rows.ts)
     solution = Solution(
         ts=rows.ts,
         ys=ys,
         multipliers=rows.multipliers,
         details=rows.details,
-        audit=audit(told, rows.energies),
+        audit=audit(measured, rows.energies),
         stats=Statistics(
             newton_iterations=rows.costs.iterations,
             residual=rows.costs.residual,

@@ -13,24 +13,23 @@ from .audit import Audit
 
 
 class Statistics(eqx.Module):
-    """What a run cost: for each row after the start, the steps since the row before.
+    """The costs of a run, for the steps between each row and the row before it.
 
-    Shape `(times - 1,)`, one entry a step where every step is saved. At requested times
-    the shape is `(times,)`, for the first of them need not be the start.
+    The shape is `(times - 1,)`: one entry for each step if every step is saved. At
+    requested times it is `(times,)`, because the first of these need not be the start.
 
-    - `newton_iterations`: of these steps together; 0 after a failure. Those of all stages
-      count where a step has several (`Composed`), and those of rejected steps.
-    - `residual`: the largest entry of the step equations, scaled to order one, before the
-      last correction; of a step that failed what Newton came to.
-    - `halvings`: how often one of these steps had to be halved, at most; see `simulate`.
-    - `local_error`: an estimate of what these steps are off by together, as the square root
-      of an energy: of the velocities, weighted by the root of the inertia. By how they
-      change from step to step, and the order of the scheme; a guide, and no bound. The
-      estimates of all steps, over the root of twice the largest kinetic energy, tell to
-      which part of the motion its phase can be believed at most: see `phase_error`.
-    - `completed_steps`: number of steps before the first failure, or all.
-    - `rejected_steps`: of a run with a `StepController`, how many steps were repeated with
-      another length, the last one of a failed run included; else `None`.
+    - `newton_iterations`: the sum over these steps, including all stages of a step
+      (`Composed`) and rejected steps; 0 after a failure.
+    - `residual`: the largest entry of the scaled step equations before the last correction;
+      of a failed step the one that was reached.
+    - `halvings`: the largest number of halvings of one of these steps; see `simulate`.
+    - `local_error`: an estimate of the summed errors of the velocities in these steps, as
+      the square root of an energy: each is weighted by the root of its inertia. It follows
+      from the change of the velocities from step to step and the order of the scheme, and
+      is not a bound. See `Solution.phase_error`.
+    - `completed_steps`: the number of steps before the first failure.
+    - `rejected_steps`: of a run with a `StepController`, the number of steps that were
+      repeated with another length, including the last one of a failed run; else `None`.
     """
 
     newton_iterations: Int[Array, " rows"]
@@ -49,27 +48,27 @@ class Solution(eqx.Module):
     - `ts`: shape `(times,)`, from `t0` on (time).
     - `ys`: a `State` with `q` of shape `(times, nq)` and `v` of shape `(times, nv)`, or
       what `SaveAt(fn=...)` made of the states.
-    - `multipliers`: shape `(times, nc)`, `lambda` of the step that ends at each row:
-      joints, driven constraints, relations between coordinates, in this order; row 0 those
-      of the consistent start. The force on the coordinates is `-B^T lambda`.
-    - `details`: what the scheme reports of its own, for the steps that end at the rows
-      after the start (`KappaDecaying`: kappa, shape `(times - 1,)`), or `None`.
+    - `multipliers`: shape `(times, nc)`, `lambda` of the step that ends at each row: of
+      joints, driven constraints and relations between coordinates, in this order. Those of
+      row 0 belong to the consistent start. The force on the coordinates is `-B^T lambda`.
+    - `details`: what only this scheme reports, for the steps that end at the rows after
+      the start (`KappaDecaying`: kappa, shape `(times - 1,)`), or `None`.
     - `audit`: energies and constraint residuals.
-    - `stats`: what the run cost; see `Statistics`.
+    - `stats`: the costs of the run; see `Statistics`.
     - `end`: the last state that was reached, after `stats.completed_steps` steps: the last
-      row, or where a failed step began. The start for a run that goes on from there.
+      row, or the state in which a failed step began. A further run can start from it.
     - `result`: `RESULTS.successful`, or the first failure.
 
-    Rows after a failed step are NaN; those before it are what they would be without it.
+    Rows after a failed step are NaN; the rows before it are not affected.
 
-    At times that were requested (`saveat=SaveAt(ts=...)`) multipliers and details
-    are those of the step that a row lies in or ends. The energies of the audit are those of
-    its state; dissipation and work are those of the steps that have ended since the row
-    before (of the first row since the start). So the balance of the audit is exact between
-    rows at the ends of steps: the start, the end, and all rows of `SaveAt(every=...)`.
+    At requested times (`saveat=SaveAt(ts=...)`) multipliers and details are those of the
+    step in which a row lies, or which ends there. The energies of the audit are those of
+    the row's state; dissipation and work are those of the steps that have ended since the
+    row before (for the first row, since the start). The balance of the audit is therefore
+    exact only between rows at the ends of steps, such as all rows of `SaveAt(every=...)`.
 
-    `print` tells the outcome, the steps and what Newton's method took for them, and the
-    account of the energy; of a batch all lanes together.
+    `print` shows the outcome, the number of steps and iterations, and the audit; for a
+    batch, all lanes together.
     """
 
     ts: Float[Array, " times"]
@@ -83,13 +82,14 @@ class Solution(eqx.Module):
 
     @property
     def phase_error(self) -> Scalar:
-        """What the motion may be off by at the end, in parts of itself: an estimate.
+        """An estimate of the relative error of the motion at the end of the run.
 
-        The local errors of all steps, over the largest velocity. Energy and constraints
-        hold at any step; this tells whether the motion is resolved.
+        It is the sum of the local errors of all steps over the largest velocity. Energy and
+        constraints hold for steps of any length; this tells whether the steps resolve the
+        motion.
         """
         kinetic, potential = self.audit.kinetic, self.audit.potential
-        # Below the round-off of the potential energy nothing moves: a system at rest.
+        # A kinetic energy below the round-off of the potential energy counts as rest.
         rest = jnp.finfo(kinetic.dtype).eps * jnp.nanmax(jnp.abs(potential), axis=-1)
         largest = jnp.maximum(jnp.nanmax(kinetic, axis=-1), rest)
         total = jnp.sum(self.stats.local_error, axis=-1)

@@ -1,7 +1,4 @@
-"""One step: a solve, or a chain of solves.
-
-This is the layer where solves are counted.
-"""
+"""One step: a solve, or several solves in a row."""
 
 from typing import Any
 
@@ -23,14 +20,15 @@ from .stage import first_memory, Memory
 
 
 class Warm(eqx.Module):
-    """What the last steps leave for the next.
+    """What one step passes to the next.
 
-    Pass it from one `step` to the next, with the same `h`, to start Newton closer.
+    Pass it from one `step` to the next, with the same `h`: Newton's method then needs fewer
+    iterations.
 
-    - `stages`: for each stage, stacked.
-    - `rest`: what the rounding of `q` has withheld from it so far, less than its last
-      digit. Added to the next displacement, it does not accumulate: bodies far from the
-      origin keep the energy as well as others.
+    - `stages`: the memory of each stage, stacked.
+    - `rest`: the part of the displacements that was lost by rounding `q`, less than its
+      last digit. The next step adds it to its displacement, so that rounding errors do not
+      accumulate, even if bodies are far from the origin.
     """
 
     stages: Memory
@@ -43,9 +41,9 @@ class StepOutput(eqx.Module):
     - `state`: at the end of the step; meaningless if the step failed.
     - `multipliers`: `lambda` of the step, `(nc,)`, of joints, driven constraints and
       relations between coordinates, in this order.
-    - `energies`: what the scheme removed, and what `force` and `driven` constraints
-      brought in.
-    - `details`: what the scheme reports of its own, or `None`.
+    - `energies`: the energy that the scheme removed, and the work of `force` and `driven`
+      constraints.
+    - `details`: what only this scheme reports, or `None`.
     - `newton_iterations`: over all solves of the step.
     - `residual`: of the step equations, see `Statistics`.
     - `halvings`: how often the step, or a stage of it, was halved.
@@ -74,7 +72,7 @@ def first_warm(
     acceleration: Velocities,
     multipliers: Multipliers,
 ) -> Warm:
-    """The memory of a run that begins: every stage predicted from the start."""
+    """The memory at the start of a run, where every stage is predicted from the start."""
 
     def first(length):
         return first_memory(
@@ -95,7 +93,7 @@ def advance(
     skip: Flag,
     max_halvings: int | None = None,
 ) -> StepOutput:
-    """One step of a scheme, without checks. With `skip` it costs no iteration."""
+    """One step of a scheme, without checks. If `skip` is true it takes no iteration."""
 
     def stage(carry, stage_input):
         state, rest = carry
@@ -124,7 +122,7 @@ def advance(
     iterations, residuals, halvings, sizes = costs
     return StepOutput(
         state=state,
-        # The mean force over the step: stages count by their length, backwards ones too.
+        # The mean force over the step: stages are weighted by their (signed) lengths.
         multipliers=lengths @ multipliers,
         energies=jax.tree.map(jnp.sum, energies),
         details=jax.tree.map(lambda x: x[-1], details),
@@ -138,7 +136,7 @@ def advance(
 
 
 def _sum_and_rest(x: Array, y: Array) -> tuple[Array, Array]:
-    """The rounded sum and what the rounding took, exactly (D. E. Knuth's two-sum)."""
+    """The rounded sum, and exactly what the rounding lost (D. E. Knuth's two-sum)."""
     total = x + y
     of_y = total - x
     rest = (x - (total - of_y)) + (y - of_y)
@@ -152,7 +150,7 @@ def _single_step(system, scheme, state, args, h, warm, root_finder, max_halvings
     fresh = lambda: first_warm(scheme, model, state, h, *model.accelerations(state))
     if warm is None:
         warm = fresh()
-    elif _kinds(warm) != _kinds(eqx.filter_eval_shape(fresh)):
+    elif _types(warm) != _types(eqx.filter_eval_shape(fresh)):
         raise ValueError(
             "`warm` is not of this scheme and system. Pass the `warm` of the step before, "
             "or none."
@@ -163,7 +161,7 @@ def _single_step(system, scheme, state, args, h, warm, root_finder, max_halvings
     return eqx.tree_at(lambda out: out.state, out, model.to_user(out.state))
 
 
-def _kinds(tree: PyTree[Any]) -> Any:
+def _types(tree: PyTree[Any]) -> Any:
     leaves, structure = jax.tree.flatten(tree)
     return structure, [(jnp.shape(x), jnp.result_type(x)) for x in leaves]
 
@@ -182,9 +180,9 @@ def step(
 ) -> StepOutput:
     """Advance one state by one step of length `h`, for loops of your own.
 
-    Never raises on a failure of the step: look at `result`. All of `state`, `args`, `h`,
-    `t` and the numbers of the scheme are traced, so the function can be put in `jit`,
-    `vmap`, `lax.scan`, `grad` and `jvp`.
+    A failed step raises no error: check `result`. All of `state`, `args`, `h`, `t` and the
+    numbers of the scheme are traced, so the function can be used in `jit`, `vmap`,
+    `lax.scan`, `grad` and `jvp`.
 
     **Arguments:**
 
@@ -192,8 +190,8 @@ def step(
       constraints; see `initial_state`.
     - `h`: length of the step (time), positive.
     - `t`: the time at which the step starts, for `force` and `driven`.
-    - `warm`: `warm` of the step before, if it had the same `h`. Without it the
-      accelerations and multipliers at `state` are computed to predict the step.
+    - `warm`: that of the step before, if it had the same `h`. Otherwise the step is
+      predicted from the accelerations and multipliers at `state`.
     - `root_finder`, `max_halvings`: see `simulate`.
 
     **Returns:** a `StepOutput`.

@@ -1,4 +1,4 @@
-"""How a run chooses its steps."""
+"""The interface of step controllers, and steps of equal length."""
 
 import abc
 from typing import Any
@@ -19,11 +19,11 @@ from .step import StepOutput, Warm
 
 
 class Verdict(eqx.Module):
-    """What becomes of a step that was tried.
+    """The decision about an attempted step.
 
-    - `accepted`: whether the run goes on from its end.
-    - `result`: a failure, if there is nothing more to try.
-    - `memory`: for the next step.
+    - `accepted`: whether the run continues from its end.
+    - `result`: a failure, if the run must end here.
+    - `memory`: the memory of the plan for the next step.
     """
 
     accepted: Flag
@@ -32,13 +32,13 @@ class Verdict(eqx.Module):
 
 
 class AbstractPlan(eqx.Module):
-    """The steps of one run. Places in the run are counted in units of `unit` from `t0`.
+    """The steps of one run. A place in the run is the time since `t0` in units of `unit`.
 
-    - `t0`, `t1`: the times of its start and its end.
-    - `unit`: the time that is counted in: the length of equal steps, or of the whole run.
-    - `last`: the place of the end, in this unit.
-    - `max_attempts`: steps that may be tried, rejected ones included.
-    - `is_counted`: whether exactly `max_attempts` steps lead to the end.
+    - `t0`, `t1`: the times of the start and the end.
+    - `unit`: the length of equal steps, or of the whole run.
+    - `last`: the place of the end.
+    - `max_attempts`: the number of steps that may be attempted, including rejected ones.
+    - `is_counted`: whether the run has exactly `max_attempts` steps.
     """
 
     t0: eqx.AbstractVar[Scalar]
@@ -49,12 +49,12 @@ class AbstractPlan(eqx.Module):
     is_counted: eqx.AbstractVar[bool]
 
     def time(self, place: Scalar) -> Scalar:
-        """The time at a place: counted, and not summed up."""
+        """The time at a place; a product, so that no round-off accumulates."""
         return jnp.where(place >= self.last, self.t1, self.t0 + self.unit * place)
 
     @abc.abstractmethod
     def begin(self, model: AbstractModel, start: State) -> PyTree[Any]:
-        """The memory at the start of the run."""
+        """The memory of the plan at the start of the run."""
 
     @abc.abstractmethod
     def first(self) -> Scalar:
@@ -62,15 +62,15 @@ class AbstractPlan(eqx.Module):
 
     @abc.abstractmethod
     def next(self, memory: PyTree[Any], place: Scalar) -> tuple[Scalar, Scalar]:
-        """Where the step from `place` ends, and its length."""
+        """The place where the step from `place` ends, and the length of this step."""
 
     @abc.abstractmethod
     def warm(self, memory: PyTree[Any], warm: Warm, length: Scalar) -> Warm:
-        """What the last steps leave for one of this length."""
+        """What the last steps pass to a step of this length."""
 
     @abc.abstractmethod
     def kept(self, new: Warm, old: Warm) -> Warm:
-        """What an accepted step leaves; `old` is what those before it have left."""
+        """What an accepted step passes on; `old` is what the step before passed to it."""
 
     @abc.abstractmethod
     def judge(
@@ -81,41 +81,41 @@ class AbstractPlan(eqx.Module):
         out: StepOutput,
         length: Scalar,
     ) -> Verdict:
-        """What becomes of a step of this length from `begin`."""
+        """The decision about a step of this length from `begin`."""
 
     @abc.abstractmethod
     def num_rejected(self, memory: PyTree[Any]) -> Any:
-        """How many steps were repeated with another length; `None` where none can be."""
+        """The number of steps that were repeated with another length; `None` if a plan
+        never does that."""
 
 
 class AbstractController(eqx.Module):
-    """What chooses the steps of a run: `EqualSteps` or a `StepController`."""
+    """Chooses the steps of a run: `EqualSteps` or a `StepController`."""
 
     @abc.abstractmethod
     def plan(
         self, scheme: AbstractScheme, h: Scalar, t0: Scalar, end: "End"
     ) -> AbstractPlan:
-        """The steps of a run from `t0` on, of which `h` is the first."""
+        """The steps of a run that starts at `t0` with a step of length `h`."""
 
 
 class End(eqx.Module):
-    """Where a run ends: after a number of steps, or at a time, with a bound on the steps.
+    """Where a run ends: after `num_steps`, or at the time `t1`.
 
-    - `num_steps`: or `None`.
-    - `t1`: or `None`; then `needed` is how many steps of the length `h` lead there.
-    - `max_steps`: or `None`.
+    In a run to `t1`, `needed` is the number of steps of the length `h` to this time, and
+    `max_steps` an optional bound on the number of steps.
     """
 
-    num_steps: int | None = eqx.field(static=True)
-    t1: Scalar | None
-    needed: Scalar | None
-    max_steps: int | None = eqx.field(static=True)
+    num_steps: int | None = eqx.field(static=True, default=None)
+    t1: Scalar | None = None
+    needed: Scalar | None = None
+    max_steps: int | None = eqx.field(static=True, default=None)
 
 
 class EqualSteps(AbstractController):
-    """Steps of one length: `h`, or in a run to `t1` shortened so that a whole number fits.
+    """Steps of equal length: `h`, or in a run to `t1` the next shorter length that fits.
 
-    The first step that fails ends the run.
+    The first failed step ends the run.
     """
 
     def plan(self, scheme: AbstractScheme, h: Scalar, t0: Scalar, end: End) -> "_EqualPlan":
@@ -133,9 +133,9 @@ class EqualSteps(AbstractController):
         assert end.needed is not None
         if end.max_steps is None and not is_known(end.needed):
             raise ValueError(
-                "`max_steps` is missing: with `h`, `t0` or `t1` traced by a transformation "
-                "the number of steps is not known when the program is made. Give a bound, "
-                "such as the number of steps at the shortest `h`."
+                "`max_steps` is missing: if `h`, `t0` or `t1` are traced by a "
+                "transformation, the number of steps is not known at compile time. Give a "
+                "bound, such as the number of steps at the shortest `h`."
             )
         number = jnp.asarray(end.needed, h.dtype)
         return _EqualPlan(
@@ -194,7 +194,7 @@ def find_end(
     t0: Real,
     dtype: Any,
 ) -> End:
-    """Where a run ends, checked."""
+    """The checked end of a run."""
     if not isinstance(controller, AbstractController):
         raise TypeError(
             "`controller` must be `EqualSteps()` or a `StepController(rtol, atol)`, got "
@@ -203,9 +203,8 @@ def find_end(
         )
     if (num_steps is None) == (t1 is None):
         raise ValueError(
-            "Say how long the run is in one of two ways: a number of steps of the length "
-            "`h`, `num_steps`, or the time of its end, `t1`. Got "
-            + ("neither." if t1 is None else "both.")
+            "Pass either `num_steps`, the number of steps of the length `h`, or `t1`, the "
+            "time of the end. Got " + ("neither." if t1 is None else "both.")
         )
     if num_steps is not None:
         if max_steps is not None or not isinstance(controller, EqualSteps):
@@ -213,7 +212,7 @@ def find_end(
                 "`num_steps` counts equal steps: a `StepController` and `max_steps` belong "
                 "to runs to an end time. Give `t1` instead."
             )
-        return End(positive_integer("num_steps", num_steps), None, None, None)
+        return End(num_steps=positive_integer("num_steps", num_steps))
     if jnp.ndim(t1) != 0 or (is_known((t0, t1)) and not _real(t0) < _real(t1) < np.inf):
         raise ValueError(
             f"`t1` must be a finite time after the start of the run, got t1 = {t1} with "
@@ -222,7 +221,7 @@ def find_end(
     if max_steps is not None:
         max_steps = positive_integer("max_steps", max_steps)
     needed: Any = _steps_that_fit(h, t0, t1, dtype)
-    return End(None, jnp.asarray(t1, dtype), needed, max_steps)
+    return End(t1=jnp.asarray(t1, dtype), needed=needed, max_steps=max_steps)
 
 
 def _real(number: Real) -> float:
@@ -230,9 +229,9 @@ def _real(number: Real) -> float:
 
 
 def _steps_that_fit(h: Real, t0: Real, t1: Real, dtype: Any) -> Scalar | float:
-    """`ceil((t1 - t0)/h)`, but for the round-off of the times and of the quotient.
+    """`ceil((t1 - t0)/h)`, except for the round-off of the times and of the quotient.
 
-    A number where all three are known.
+    The result is a NumPy number if all three are known.
     """
     numbers: Any = np if is_known((h, t0, t1)) else jnp
     length, begin, end = (numbers.asarray(x, dtype) for x in (h, t0, t1))
