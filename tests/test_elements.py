@@ -83,9 +83,9 @@ def test_a_sum_over_elements_is_the_plain_function():
     rods = ej.Elements(lambda x, k, args: x**2 * args[k], [[0, 3], [1, 2]])
     lengths = jnp.array([1.0, 2.0])
     np.testing.assert_allclose(rods(jnp.arange(4.0), lengths), [0, 9, 2, 8])
-    with pytest.raises(ValueError, match="names coordinate 3, and there are 3"):
+    with pytest.raises(ValueError, match="contains the index 3, but there are 3"):
         rods(jnp.arange(3.0))
-    with pytest.raises(ValueError, match="numbers of the coordinates"):
+    with pytest.raises(ValueError, match="indices of the coordinates"):
         ej.Elements(lambda x, k, args: x, [[0.5]])
     with pytest.raises(ValueError, match="start from 0"):
         ej.Elements(lambda x, k, args: x, [[-1]])

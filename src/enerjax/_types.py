@@ -8,7 +8,7 @@ from typing_extensions import TypeAliasType
 # Dimensions used in every annotation of the package:
 # nq coordinates, nv velocities, nc constraints (joints first, then those of the
 # coordinates), nj joint constraints. `...` stands for the time axis of a `Solution`.
-Args: TypeAlias = Any
+Args = TypeAliasType("Args", Any)
 Scalar: TypeAlias = Float[Array, ""]
 Flag: TypeAlias = Bool[Array, ""]
 Count: TypeAlias = Int[Array, ""]
@@ -17,7 +17,7 @@ Velocities: TypeAlias = Float[Array, " nv"]
 Multipliers: TypeAlias = Float[Array, " nc"]
 JointMultipliers: TypeAlias = Float[Array, " nj"]
 Times: TypeAlias = Float[Array, " times"]
-# What users may write for a number and for a vector: types with a name, so that signatures
-# can be read.
+# The types of users' arguments have names, so that signatures can be read.
 Real = TypeAliasType("Real", ScalarLike)
 Vector = TypeAliasType("Vector", ArrayLike | Sequence[ScalarLike])
+EntryIndices = TypeAliasType("EntryIndices", Sequence[int])

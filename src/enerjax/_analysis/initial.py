@@ -1,6 +1,6 @@
 """Consistent starts: positions, velocities, accelerations and multipliers."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -11,7 +11,16 @@ from jaxtyping import Array, Float
 from .._operators import make_model
 from .._programs import is_known
 from .._system import AbstractSystem, check_system, State, System
-from .._types import Args, Count, Flag, Multipliers, Real, Vector, Velocities
+from .._types import (
+    Args,
+    Count,
+    EntryIndices,
+    Flag,
+    Multipliers,
+    Real,
+    Vector,
+    Velocities,
+)
 from .projection import project_position, project_velocity, rank_of_constraints
 
 
@@ -43,8 +52,8 @@ def initial_state(
     args: Args = None,
     *,
     t: Real = 0.0,
-    known_q: Sequence[int] = (),
-    known_v: Sequence[int] = (),
+    known_q: EntryIndices = (),
+    known_v: EntryIndices = (),
     throw: bool = True,
 ) -> State:
     """The `State` nearest to `(q, v)` that satisfies the constraints.
@@ -63,8 +72,8 @@ def consistent_start(
     args: Args = None,
     *,
     t: Real = 0.0,
-    known_q: Sequence[int] = (),
-    known_v: Sequence[int] = (),
+    known_q: EntryIndices = (),
+    known_v: EntryIndices = (),
     throw: bool = True,
 ) -> ConsistentStart:
     """Projects a start onto the constraints, and finds its accelerations and multipliers.
@@ -100,7 +109,7 @@ def consistent_start(
 
 
 def start_near(
-    system: AbstractSystem, state: State, args: Args, t: Real, known_v: Sequence[int]
+    system: AbstractSystem, state: State, args: Args, t: Real, known_v: EntryIndices
 ) -> State:
     """`initial_state`, except that known velocities are changed if joints forbid them."""
     return _nearest(system, state, args, t, ((), known_v), keep_known=False, throw=True)
@@ -111,7 +120,7 @@ def _nearest(
     state: State,
     args: Args,
     t: Real,
-    known: tuple[Sequence[int], Sequence[int]],
+    known: tuple[EntryIndices, EntryIndices],
     *,
     keep_known: bool,
     throw: bool,
@@ -130,7 +139,7 @@ def _start(
     state: State,
     args: Args,
     t: Real,
-    known: tuple[Sequence[int], Sequence[int]],
+    known: tuple[EntryIndices, EntryIndices],
     *,
     keep_known: bool,
     throw: bool,
@@ -194,7 +203,7 @@ def _raise_unless(
     return start
 
 
-def _indices(name: str, indices: Sequence[int], x: Array) -> tuple[int, ...]:
+def _indices(name: str, indices: EntryIndices, x: Array) -> tuple[int, ...]:
     """Checked indices of entries of `x`."""
     array = np.asarray(indices)
     if array.size == 0:

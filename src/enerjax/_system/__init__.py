@@ -11,7 +11,7 @@ from .canonical import (
 )
 from .checks.shapes import describe as describe, energies as energies
 from .checks.system import (
-    check_not_mixed as check_not_mixed,
+    check_not_varying as check_not_varying,
     check_number as check_number,
     check_system as check_system,
 )

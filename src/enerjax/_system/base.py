@@ -1,4 +1,4 @@
-"""What all systems have in common, and the conventions of the whole package.
+"""The interface of all systems, and the conventions of the whole package.
 
 Equations of motion (paper eq. 12), for coordinates `q` (nq), velocities `v = L(q) qdot`
 (nv), constant inertia `M`, potential `V(q)` and holonomic constraints `Phi(q) = 0`:
@@ -14,10 +14,9 @@ so the force of a constraint on the coordinates is `-B^T lambda`, and a potentia
 with `-dV/dq`. Units are the user's own, as long as they are consistent: a multiplier has
 the dimension of an energy per unit of its constraint.
 
-Where a system has forces `f(q, v, t)`, `L^T f` stands on the right of the first equation,
-and where it has driven constraints `g(q, t) = 0`, their rows stand in `Phi` and their
-`g_q^T lambda` beside `B^T lambda`: joints first, driven constraints next, relations between
-coordinates last.
+Forces `f(q, v, t)` add `L^T f` to the right-hand side of the first equation. Driven
+constraints `g(q, t) = 0` add rows to `Phi`, and `g_q^T lambda` to `B^T lambda`. The rows
+are ordered: joints first, driven constraints next, relations between coordinates last.
 """
 
 import abc
@@ -44,7 +43,7 @@ def inexact(x: Any) -> Array:
     return x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(float)
 
 
-# The functions of a system: types with a name, so that signatures can be read.
+# The types of the functions of a system have names, so that signatures can be read.
 Potential = TypeAliasType("Potential", Callable[[Coordinates, Args], Scalar])
 Constraint = TypeAliasType("Constraint", Callable[[Coordinates, Args], Multipliers])
 Kinematics = TypeAliasType(
@@ -64,9 +63,9 @@ class State(eqx.Module):
     - `q`: coordinates, shape `(nq,)`, in the units of the user's own coordinates.
     - `v`: velocities, shape `(nv,)`: `L(q) qdot` of a system with `kinematics`, else
       `qdot`; of a `System.from_hamiltonian` the momenta `p`.
-    - `t`: the time, which schemes give to the states of a system with `force` or `driven`
-      while they work; `None` in all others, and in what users are given. To begin at
-      another time than 0 say so to `initial_state` and `simulate`.
+    - `t`: the time. It is for schemes, which set it if the system has a `force` or is
+      `driven`; it is `None` in every state that is returned to users. To start at a time
+      other than 0, pass it to `initial_state` and `simulate`.
     """
 
     q: Float[Array, "... nq"] = eqx.field(converter=inexact)
@@ -85,16 +84,16 @@ class AbstractSystem(eqx.Module):
 
     @property
     def is_timed(self) -> bool:
-        """Whether time enters at all."""
+        """Whether the equations of motion need the time."""
         return self.force is not None or self.driven is not None
 
     @abc.abstractmethod
     def kinetic_energy(self, state: State, args: Args = None) -> Scalar:
-        """The energy of the motion in one state."""
+        """The kinetic energy of one state."""
 
     @abc.abstractmethod
     def potential_energy(self, state: State, args: Args = None) -> Scalar:
-        """The energy of one configuration at rest."""
+        """The potential energy of one state: its energy at rest."""
 
     @abc.abstractmethod
     def energy(self, state: State, args: Args = None) -> Scalar:
@@ -102,14 +101,34 @@ class AbstractSystem(eqx.Module):
 
     @abc.abstractmethod
     def inertia(self, state: State, args: Args) -> Symmetric:
-        """The symmetric matrix that takes velocities to momenta."""
+        """The symmetric matrix that maps velocities to momenta."""
 
 
-def check_function(
-    name: str, signature: str, value: Any, *, optional: bool = False
-) -> None:
-    """Raises for what is no function."""
-    if not (callable(value) or (optional and value is None)):
+SIGNATURES = dict(
+    potential="(q, args)",
+    hamiltonian="(q, p, args)",
+    constraint="(q, args)",
+    coordinate_constraint="(q, args)",
+    force="(q, v, t, args)",
+    driven="(q, t, args)",
+    symmetry="(q, args)",
+    kinematics="(q, args)",
+)
+_OPTIONAL = ("constraint", "coordinate_constraint", "force", "driven", "symmetry")
+
+
+def check_function(name: str, value: Any, signature: str) -> None:
+    """Raises a `TypeError` unless `value` is a function."""
+    if not callable(value):
         raise TypeError(
             f"`{name}` must be a function of {signature}, got {type(value).__name__}."
         )
+
+
+def check_functions(system: AbstractSystem, required: str) -> None:
+    """Raises a `TypeError` unless all fields of a system that should be functions are."""
+    check_function(required, getattr(system, required), SIGNATURES[required])
+    for name in _OPTIONAL:
+        value = getattr(system, name, None)
+        if value is not None:
+            check_function(name, value, SIGNATURES[name])

@@ -1,4 +1,4 @@
-"""Systems of any kinetic energy, as the schemes see them: in `q` and momenta `p`."""
+"""Systems with any kinetic energy, which schemes integrate in `q` and momenta `p`."""
 
 import abc
 from collections.abc import Callable
@@ -12,6 +12,7 @@ from .._types import Args, Coordinates, Scalar, Velocities
 from .base import (
     AbstractSystem,
     check_function,
+    check_functions,
     Constraint,
     Driven,
     Force,
@@ -32,15 +33,15 @@ class AbstractCanonicalSystem(AbstractSystem):
 
     @abc.abstractmethod
     def masses(self, q: Coordinates, p: Coordinates, args: Args) -> Coordinates:
-        """A mass for each coordinate, to measure increments of `q` and `p` together."""
+        """A mass for each coordinate, by which increments of `q` and `p` are compared."""
 
     @abc.abstractmethod
     def momentum(self, state: State, args: Args) -> Coordinates:
-        """`p` of a state as the user gives it."""
+        """The momenta `p` of a user's state."""
 
     @abc.abstractmethod
     def velocity(self, q: Coordinates, p: Coordinates, args: Args) -> Velocities:
-        """The `v` of the state that the user is given."""
+        """The `v` of the state that is returned to the user."""
 
 
 class LagrangianSystem(AbstractCanonicalSystem):
@@ -55,12 +56,8 @@ class LagrangianSystem(AbstractCanonicalSystem):
     redundant: bool = eqx.field(default=False, static=True)
 
     def __check_init__(self):
-        check_function("kinetic", "(q, qdot, args)", self.kinetic)
-        check_function("potential", "(q, args)", self.potential)
-        check_function("constraint", "(q, args)", self.constraint, optional=True)
-        check_function("force", "(q, qdot, t, args)", self.force, optional=True)
-        check_function("driven", "(q, t, args)", self.driven, optional=True)
-        check_function("symmetry", "(q, args)", self.symmetry, optional=True)
+        check_function("kinetic", self.kinetic, "(q, qdot, args)")
+        check_functions(self, required="potential")
 
     def kinetic_energy(self, state: State, args: Args = None) -> Scalar:
         return self.kinetic(state.q, state.v, args)
@@ -100,11 +97,7 @@ class HamiltonianSystem(AbstractCanonicalSystem):
     redundant: bool = eqx.field(default=False, static=True)
 
     def __check_init__(self):
-        check_function("hamiltonian", "(q, p, args)", self.hamiltonian)
-        check_function("constraint", "(q, args)", self.constraint, optional=True)
-        check_function("force", "(q, qdot, t, args)", self.force, optional=True)
-        check_function("driven", "(q, t, args)", self.driven, optional=True)
-        check_function("symmetry", "(q, args)", self.symmetry, optional=True)
+        check_functions(self, required="hamiltonian")
 
     def kinetic_energy(self, state: State, args: Args = None) -> Scalar:
         """`H(q, p) - H(q, 0)`"""
@@ -118,13 +111,13 @@ class HamiltonianSystem(AbstractCanonicalSystem):
         return self.hamiltonian(state.q, state.v, args)
 
     def inertia(self, state: State, args: Args) -> Float[Array, "nq nq"]:
-        return jnp.linalg.inv(self._compliance(state.q, state.v, args))
+        return jnp.linalg.inv(self._inverse_inertia(state.q, state.v, args))
 
-    def _compliance(self, q: Coordinates, p: Coordinates, args: Args) -> Array:
+    def _inverse_inertia(self, q: Coordinates, p: Coordinates, args: Args) -> Array:
         return jax.hessian(self.hamiltonian, argnums=1)(q, p, args)
 
     def masses(self, q, p, args):
-        return 1 / jnp.diagonal(self._compliance(q, p, args))
+        return 1 / jnp.diagonal(self._inverse_inertia(q, p, args))
 
     def hamiltonian_and_rate(self, q, p, args):
         return jax.value_and_grad(self.hamiltonian, argnums=1)(q, p, args)

@@ -16,24 +16,23 @@ from .._types import Args, Coordinates
 class Elements(eqx.Module):
     """One function of a few coordinates, applied to many groups of them.
 
-    Give it as the `potential` of a `System` (an energy that is a sum over springs, beams,
-    weights), alone or as a sum of several, `springs + weights`; or call it in your own
-    `constraint`. The program is as large as for one element. Schemes that need the
-    stiffness of the elements one by one (`EnergyConsistent` of a large system) find it
-    here.
+    Use it as the `potential` of a `System`, an energy that is a sum over springs, beams or
+    weights. Several can be added, `springs + weights`, and `constraint` functions can call
+    them too. The program is as large as for one element. For large
+    systems `EnergyConsistent` takes the stiffness of each element from here.
 
         springs = ej.Elements(energy_of_spring, table)
         energy_of_spring(x, k, args)  # coordinates table[k] of spring number k
 
     **Arguments:**
 
-    - `fn`: `fn(x, k, args)` of the coordinates `x` of an element, shape `(width,)`, and its
-      number `k`, with which it finds its own parameters (`args["stiffness"][k]`). Returns
-      a scalar (the elements are summed), or a vector (they are concatenated).
-    - `table`: the numbers of the coordinates of each element, shape `(elements, width)`.
+    - `fn`: `fn(x, k, args)` of the coordinates `x` of element `k`, shape `(width,)`, which
+      finds the parameters of this element as `args["stiffness"][k]`. Its values are summed
+      if they are scalars, and concatenated if they are vectors.
+    - `table`: the indices of the coordinates of each element, shape `(elements, width)`.
 
-    **Raises:** `TypeError` and `ValueError` for a function or table that is none; when it
-    is called, `ValueError` for a number beyond the coordinates.
+    **Raises:** `TypeError` and `ValueError` for bad arguments; when it is called,
+    `ValueError` for an index beyond the coordinates.
     """
 
     fn: Callable[[Float[Array, " width"], Any, Args], Array]
@@ -49,12 +48,12 @@ class Elements(eqx.Module):
         array = np.asarray(table)
         if array.ndim != 2 or not np.issubdtype(array.dtype, np.integer):
             raise ValueError(
-                "`Elements(fn, table)`: `table` must hold the numbers of the coordinates "
+                "`Elements(fn, table)`: `table` must hold the indices of the coordinates "
                 "of each element, integers of shape (elements, width); got shape "
                 f"{array.shape} of {array.dtype}."
             )
         if array.min(initial=0) < 0:
-            raise ValueError("`Elements(fn, table)`: numbers in `table` start from 0.")
+            raise ValueError("`Elements(fn, table)`: indices in `table` start from 0.")
         self.fn, self.table, self.others = fn, Indices(array), others
 
     def each(self, q: Coordinates, args: Args = None) -> Float[Array, "elements ..."]:
@@ -62,8 +61,8 @@ class Elements(eqx.Module):
         table = self.table.array
         if table.max(initial=-1) >= q.size:
             raise ValueError(
-                f"`Elements(fn, table)`: `table` names coordinate {table.max()}, and there "
-                f"are {q.size}, counted from 0."
+                f"`Elements(fn, table)`: `table` contains the index {table.max()}, but "
+                f"there are {q.size} coordinates, counted from 0."
             )
         numbers = jnp.arange(table.shape[0])
         return jax.vmap(self.fn, in_axes=(0, 0, None))(q[table], numbers, args)

@@ -1,7 +1,7 @@
-"""The linear map `L` in `v = L(q) qdot`, and what follows from it.
+"""The linear map `L` in `v = L(q) qdot`, its transpose and its inverse.
 
-`lift` is the inverse that the schemes need: `qdot = L^+ v` solves `L qdot = v` together
-with `B_c qdot = 0`, `B_c` the Jacobian of the coordinate constraints.
+The inverse `qdot = L^+ v`, which is called `lift`, solves `L qdot = v` together with
+`B_c qdot = 0`, where `B_c` is the Jacobian of the coordinate constraints.
 """
 
 import abc
@@ -28,7 +28,7 @@ class AbstractKinematics(eqx.Module):
         coordinate: Callable[[Coordinates], Float[Array, " ncc"]],
         args: Args,
     ) -> "AbstractKinematics":
-        """The same, knowing the independent blocks of `L` over `B_c`."""
+        """The same map, with the independent blocks of `L` stacked on `B_c`."""
 
     @abc.abstractmethod
     def push(self, q: Coordinates, rate: Coordinates, args: Args) -> Velocities:
@@ -52,7 +52,7 @@ class AbstractKinematics(eqx.Module):
     def gyroscopic(
         self, q: Coordinates, momentum: Velocities, dq: Coordinates, args: Args
     ) -> Coordinates | None:
-        """`G(q, momentum) dq`, or `None` where `L` does not depend on `q`."""
+        """`G(q, momentum) dq`, or `None` if `L` does not depend on `q`."""
 
 
 class IdentityKinematics(AbstractKinematics):
@@ -78,7 +78,7 @@ class ConfigurationKinematics(AbstractKinematics):
     """`v = L(q) qdot` with a user's function `L(q, args)`: bodies that rotate."""
 
     matrix: Callable[[Coordinates, Args], Float[Array, "nv nq"]]
-    # Of `L` over `B_c`.
+    # The independent blocks of `L` stacked on `B_c`, if there are several.
     parts: Parts | None = eqx.field(static=True, default=None)
 
     def in_parts(self, q, coordinate, args):
@@ -108,7 +108,7 @@ class ConfigurationKinematics(AbstractKinematics):
         return solve_parts(self.parts, square, jnp.pad(v, (0, q.size - v.size)))
 
     def gyroscopic(self, q, momentum, dq, args):
-        # G_ij = sum_k mu_k (dL_ki/dq_j - dL_kj/dq_i), paper eq. (11), applied to dq:
-        # the change of L^T mu along dq minus the gradient of mu . L dq.
+        # G_ij = sum_k mu_k (dL_ki/dq_j - dL_kj/dq_i), paper eq. (11), so G dq is the change
+        # of L^T mu along dq minus the gradient of mu . L dq.
         _, along = jax.jvp(lambda x: self.pull(x, momentum, args), (q,), (dq,))
         return along - jax.grad(lambda x: momentum @ self.push(x, dq, args))(q)

@@ -9,6 +9,7 @@ from .._types import Args, Coordinates, Scalar, Vector, Velocities
 from .base import (
     AbstractSystem,
     check_function,
+    check_functions,
     Constraint,
     Driven,
     Force,
@@ -16,6 +17,7 @@ from .base import (
     Kinematics,
     KineticEnergy,
     Potential,
+    SIGNATURES,
     State,
     Symmetry,
 )
@@ -35,31 +37,32 @@ class System(AbstractSystem):
     - `constraint`: `constraint(q, args)`, a vector that vanishes in every admissible
       configuration: joints, rods. Leave it out if there is none.
     - `kinematics`: `L(q, args)`, the `(nv, nq)` matrix in `v = L(q) qdot`. Leave it out
-      where the velocities are the rates of the coordinates.
+      if the velocities are the rates of the coordinates.
     - `coordinate_constraint`: `coordinate_constraint(q, args)`, a vector of `nq - nv`
       relations that the coordinates obey by definition, such as `p @ p - 1` for a unit
-      quaternion. Its time derivative vanishes for every `v`, so it is imposed at
-      position level only. Needs `kinematics`.
-    - `force`: `force(q, v, t, args)`, the forces that no potential has, shape `(nv,)`,
-      conjugate to `v`: their power is `force . v`. For a body with `v = (xdot, Omega)`
-      the force in space and the torque in body axes. Dampers, motors, loads that depend
-      on the time `t`. `Composed` cannot take them, and others are of order 2 with them.
+      quaternion. Its time derivative vanishes for every `v`, so it is enforced at
+      position level only. It needs `kinematics`.
+    - `force`: `force(q, v, t, args)`, forces without a potential, such as dampers, motors
+      and loads that depend on the time `t`; shape `(nv,)`, conjugate to `v`: their power is
+      `force . v`. For a body with `v = (xdot, Omega)` they are the force in space and the
+      torque in body axes. With forces schemes are of order 2, and `Composed` cannot be
+      used.
     - `driven`: `driven(q, t, args)`, a vector that vanishes in every admissible
-      configuration at time `t`: a pivot that is moved, a prescribed angle. Held as
-      `constraint` is, and twice differentiable in `t`.
-    - `symmetry`: `symmetry(q, args)`, shape `(ns, nv)`: in each row the velocities of a
-      motion that is expected to change no energy and no constraint, such as a common
-      translation or rotation. It changes nothing but the audit, which then follows the
-      momenta that belong to them.
-    - `redundant`: whether constraints may repeat each other, as those of over-constrained
-      mechanisms do. Multipliers are then of least norm (each in the measure of its
-      constraint), to the order of the scheme; the motion does not depend on it.
+      configuration at time `t`: a moving pivot, a prescribed angle. It must be twice
+      differentiable in `t`.
+    - `symmetry`: `symmetry(q, args)`, shape `(ns, nv)`. Each row contains the velocities of
+      a motion that changes neither energy nor constraints, such as a common translation or
+      rotation. The audit then reports the momenta that belong to these motions; nothing
+      else changes.
+    - `redundant`: whether constraints may be redundant, as in over-constrained mechanisms.
+      Multipliers then have the least norm (each in the measure of its constraint), to the
+      order of the scheme; the motion does not depend on this choice.
 
     `args` is any pytree; the functions must be smooth and written with `jax.numpy`.
 
     A function of the wrong shape, an inertia that is not symmetric positive definite and
-    a kinetic energy that is not quadratic raise a `ValueError` when a start is made or a
-    run begins, where args and sizes are known.
+    a kinetic energy that is not quadratic raise a `ValueError` when `initial_state` or a
+    run is called, because sizes and `args` are not known before.
     """
 
     kinetic: KineticEnergy | Symmetric
@@ -85,19 +88,11 @@ class System(AbstractSystem):
         symmetry: Symmetry | None = None,
         redundant: bool = False,
     ):
-        check_function("potential", "(q, args)", potential)
-        for name, value in [
-            ("constraint", constraint),
-            ("kinematics", kinematics),
-            ("coordinate_constraint", coordinate_constraint),
-        ]:
-            check_function(name, "(q, args)", value, optional=True)
-        check_function("force", "(q, v, t, args)", force, optional=True)
-        check_function("driven", "(q, t, args)", driven, optional=True)
-        check_function("symmetry", "(q, args)", symmetry, optional=True)
+        if kinematics is not None:
+            check_function("kinematics", kinematics, SIGNATURES["kinematics"])
         if coordinate_constraint is not None and kinematics is None:
             raise ValueError(
-                "`System(coordinate_constraint=...)` without `kinematics`: where the "
+                "`System(coordinate_constraint=...)` without `kinematics`: if the "
                 "velocities are the rates of the coordinates, a relation between the "
                 "coordinates is an ordinary constraint. Pass it in `constraint`, or "
                 "give `kinematics`."
@@ -122,6 +117,9 @@ class System(AbstractSystem):
             if kinematics is None
             else ConfigurationKinematics(kinematics)
         )
+
+    def __check_init__(self):
+        check_functions(self, required="potential")
 
     def kinetic_energy(self, state: State, args: Args = None) -> Scalar:
         """`1/2 v . M v` of one state (energy)."""
@@ -157,12 +155,11 @@ class System(AbstractSystem):
     ) -> LagrangianSystem:
         """A system whose inertia depends on its coordinates.
 
-        For minimal coordinates (angles of an arm), which need no constraint at all, and
-        wherever velocities are the rates of the coordinates but `System` asks for a
-        constant inertia. Everything runs as with a `System`: schemes, derivatives, audit.
-        The schemes work with the momenta `p = dT/dqdot`, unknowns of their own here, and
-        the energy `1/2 p . A(q)^-1 p + V(q)`, `A` the Hessian of `kinetic`. Where the
-        inertia is constant a `System` does the same work with half the unknowns.
+        It suits minimal coordinates, such as the angles of an arm, which need no
+        constraint. Schemes, derivatives and the audit work as for a `System`. The schemes
+        have the momenta `p = dT/dqdot` as additional unknowns, and keep the energy `1/2 p .
+        A(q)^-1 p + V(q)`, where `A` is the Hessian of `kinetic`. If the inertia is
+        constant, use `System`: it needs half the unknowns.
 
         **Arguments:**
 
@@ -173,8 +170,8 @@ class System(AbstractSystem):
         - `force`: `force(q, qdot, t, args)`, shape `(nq,)`, conjugate to `qdot`.
         - `driven`: `driven(q, t, args)`; `symmetry`, `redundant`: see `System`.
 
-        **Returns:** what all functions take for a `System`; the `v` of a `State` is
-        `qdot`, shape `(nq,)`.
+        **Returns:** a system that all functions accept like a `System`; the `v` of a
+        `State` is `qdot`, shape `(nq,)`.
         """
         return LagrangianSystem(
             kinetic=kinetic,
@@ -198,23 +195,24 @@ class System(AbstractSystem):
     ) -> HamiltonianSystem:
         """A system given by its Hamiltonian.
 
-        For canonical coordinates (a unit quaternion and its momentum), and for energies
-        that are no quadratic form of a velocity: magnetic forces, rotating frames,
+        It suits canonical coordinates, such as a unit quaternion and its momentum, and
+        energies that are not quadratic in a velocity: magnetic forces, rotating frames,
         relativistic particles.
 
         **Arguments:**
 
         - `hamiltonian`: `hamiltonian(q, p, args)`, a scalar (energy) whose Hessian in `p`
-          is positive definite: give redundant momenta an energy too, such as
-          `(q . p)^2 / 2` of a quaternion.
-        - `constraint`: as for `from_lagrangian`. It is held in `q`, and
-          `B(q) dH/dp = 0` in `p`.
+          is positive definite. Redundant momenta need an energy too, such as
+          `(q . p)^2 / 2` for a quaternion.
+        - `constraint`: as for `from_lagrangian`. It is enforced for `q`, and
+          `B(q) dH/dp = 0` for `p`.
         - `force`: `force(q, qdot, t, args)`, shape `(nq,)`, conjugate to `qdot = dH/dp`.
         - `driven`: `driven(q, t, args)`; `symmetry` (rows of `qdot`), `redundant`: see
           `System`.
 
-        **Returns:** what all functions take for a `System`; the `v` of a `State` is the
-        momentum `p`, shape `(nq,)`. The audit counts `H(q, 0)` as potential energy.
+        **Returns:** a system that all functions accept like a `System`; the `v` of a
+        `State` is the momentum `p`, shape `(nq,)`. The audit counts `H(q, 0)` as potential
+        energy.
         """
         return HamiltonianSystem(
             hamiltonian=hamiltonian,

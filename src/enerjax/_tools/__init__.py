@@ -1,1 +1,1 @@
-"""What is done with many runs: sweeps, fits, orders, work and precision, reports."""
+"""Tools that make many runs: sweeps, fits, comparisons of schemes, reports."""

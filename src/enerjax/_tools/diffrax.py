@@ -25,11 +25,11 @@ class IndexReduced(eqx.Module):
         return self.model.lift(*y), acceleration
 
     def state(self, t: Real, y: tuple[Coordinates, Velocities]) -> State:
-        """The `State` that `y` stands for."""
+        """The `State` that corresponds to `y`."""
         return self.model.to_user(self._inner(t, y))
 
     def multipliers(self, t: Real, y: tuple[Coordinates, Velocities]) -> Multipliers:
-        """`lambda`, shape `(nc,)`, that holds the constraints there."""
+        """The multipliers `lambda` in this state, shape `(nc,)`."""
         return self.model.multipliers(self._inner(t, y))
 
     def _inner(self, t: Real, y: tuple[Coordinates, Velocities]) -> State:
@@ -41,15 +41,15 @@ class IndexReduced(eqx.Module):
 def to_diffrax(
     system: AbstractSystem, start: State, args: Args = None, *, t0: Real = 0.0
 ) -> tuple[Any, tuple[Coordinates, Velocities]]:
-    """The same model for the solvers of diffrax, to compare with or to use theirs.
+    """The same model as an ordinary differential equation for the solvers of diffrax.
 
         term, y0 = ej.to_diffrax(system, start, args)
         diffrax.diffeqsolve(term, diffrax.Dopri8(), 0.0, 10.0, 1e-3, y0, ...)
 
     The accelerations follow from the equations of motion with the constraints
-    differentiated twice (index reduction), so these solvers hold the constraints to their
-    own accuracy only: positions leave them like `t^2`, velocities like `t`. All numbers in
-    `args` and the start are leaves of the term and of `y0`; make both inside of a
+    differentiated twice (index reduction), so the constraints drift: positions like `t^2`,
+    velocities like `t`, by the error of the solver. All numbers in `args` and the start are
+    leaves of the term and of `y0`; for derivatives, call `to_diffrax` inside the
     differentiated function. The `args` of `diffeqsolve` are not used.
 
     **Arguments:**
@@ -57,13 +57,13 @@ def to_diffrax(
     - `system`, `start`, `args`: as for `simulate`.
     - `t0`: the time of the start, for `force` and `driven`.
 
-    **Returns:** a `diffrax.ODETerm` and the state `y0 = (q, v)`; of
-    `System.from_lagrangian` and `from_hamiltonian` `(q, p)`. Of the term,
-    `term.vector_field.state(t, y)` is the `State` and
-    `term.vector_field.multipliers(t, y)` the multipliers, shape `(nc,)`.
+    **Returns:** a `diffrax.ODETerm` and the state `y0 = (q, v)`; for
+    `System.from_lagrangian` and `from_hamiltonian` it is `(q, p)`.
+    `term.vector_field.state(t, y)` is the `State`, and
+    `term.vector_field.multipliers(t, y)` are the multipliers, shape `(nc,)`.
 
-    **Raises:** `ImportError` without diffrax (the extra `diffrax`); `ValueError` or
-    `TypeError` for bad input, as `simulate`.
+    **Raises:** `ImportError` if diffrax is not installed (the extra `diffrax`);
+    `ValueError` or `TypeError` for bad input, as `simulate`.
 
     **Reference:** C. W. Gear, B. Leimkuhler and G. K. Gupta, J. Comput. Appl. Math. 12-13
     (1985) 77-90, on index reduction and the drift that it brings.

@@ -1,1 +1,1 @@
-"""Whether a system makes sense, told before any step."""
+"""Checks of a system before any step."""

@@ -1,4 +1,4 @@
-"""Whether the functions of a system fit its state, before anything is evaluated."""
+"""Checks that the functions of a system fit its state, before anything is evaluated."""
 
 import inspect
 from collections.abc import Callable
@@ -9,40 +9,35 @@ import jax
 import jax.numpy as jnp
 
 from ..._types import Args
-from ..base import AbstractSystem, State
+from ..base import AbstractSystem, SIGNATURES, State
 from ..canonical import HamiltonianSystem, LagrangianSystem
 from ..kinematics import ConfigurationKinematics
 from ..separable import System
 
 
-_SIGNATURES = dict(
-    potential="`(q, args)`",
-    kinetic="`(v, args)`, or `(q, qdot, args)` of `System.from_lagrangian`,",
-    hamiltonian="`(q, p, args)`",
-    constraint="`(q, args)`",
-    coordinate_constraint="`(q, args)`",
-    force="`(q, v, t, args)`",
-    driven="`(q, t, args)`",
-    symmetry="`(q, args)`",
-    kinematics="`(q, args)`",
-)
+_KINETIC = "`(v, args)`, or `(q, qdot, args)` of `System.from_lagrangian`,"
+
+
+def _signature(role: str) -> str:
+    return _KINETIC if role == "kinetic" else f"`{SIGNATURES[role]}`"
 
 
 def describe(role: str, fn: Any) -> str:
+    """The role of a function in a system, with the name that the user gave to it."""
     name = getattr(fn, "__name__", None)
     return f"`{role}`" if name in (None, role, "<lambda>") else f"`{role}` (`{name}`)"
 
 
 def _shape(role: str, fn: Callable, *inputs: Any) -> tuple[int, ...]:
-    """Of the value of a function of the system, which must be a real array."""
+    """The shape of the value of a function of the system, which must be a real array."""
     try:
         inspect.signature(fn).bind(*inputs)
     except TypeError as error:
         raise TypeError(
-            f"{describe(role, fn)} must take {len(inputs)} arguments, {_SIGNATURES[role]} "
+            f"{describe(role, fn)} must take {len(inputs)} arguments, {_signature(role)} "
             f"here: {error}."
         ) from None
-    except ValueError:  # no signature to be had
+    except ValueError:  # `fn` has no signature, like some functions in C
         pass
     out = _traced(role, fn, *inputs)
     if not hasattr(out, "shape") or not jnp.issubdtype(out.dtype, jnp.floating):
@@ -56,7 +51,7 @@ def _shape(role: str, fn: Callable, *inputs: Any) -> tuple[int, ...]:
 
 
 def _traced(role: str, fn: Callable, *inputs: Any) -> Any:
-    """The kind of value that a function returns, and in its name what it raises."""
+    """The shape and dtype of the value of a function; its errors name the function."""
     try:
         return eqx.filter_eval_shape(fn, *inputs)
     except (
@@ -65,14 +60,14 @@ def _traced(role: str, fn: Callable, *inputs: Any) -> Any:
         jax.errors.TracerIntegerConversionError,
     ) as error:
         raise TypeError(
-            f"{describe(role, fn)} asks for the value of a number that is traced. Write it "
+            f"{describe(role, fn)} needs the value of a number that is traced. Write it "
             "with `jax.numpy`, not `math` or `numpy`, and `jnp.where` instead of `if`."
         ) from error
     except Exception as error:
         raise ValueError(
             f"{describe(role, fn)} raised {type(error).__name__}: "
             f"{str(error).removesuffix('.')}. It is called "
-            f"with {_SIGNATURES[role]}, and `args` is {_kind(inputs[-1])} here."
+            f"with {_signature(role)}, and `args` is {_kind(inputs[-1])} here."
         ) from error
 
 
@@ -113,7 +108,7 @@ def check_shapes(system: AbstractSystem, state: State, args: Args) -> None:
 def energies(
     system: AbstractSystem, state: State, args: Args
 ) -> list[tuple[str, Callable, tuple]]:
-    """The user's energy functions, their names, and what they are called with."""
+    """The roles of the user's energy functions, the functions, and their arguments."""
     q, v = state.q, state.v
     if isinstance(system, HamiltonianSystem):
         return [("hamiltonian", system.hamiltonian, (q, v, args))]

@@ -1,7 +1,7 @@
-"""A system, its state and its `args`, told what is wrong with them before any step.
+"""Checks of a system, its state and its `args`, before any step.
 
-Shapes and types are checked always, values where they are known: outside of `jit`, `vmap`
-and `grad`.
+Shapes and types are always checked. Values are checked if they are known, which is outside
+of `jit`, `vmap` and `grad`.
 """
 
 import functools
@@ -23,10 +23,10 @@ from .values import check_values
 def check_system(
     system: AbstractSystem, state: State, args: Args, t: Real
 ) -> tuple[State, Args]:
-    """Checks a system against a state, `args` and the time, and makes arrays of them."""
+    """Checks a system with a state, `args` and a time, and returns these as arrays."""
     if not isinstance(system, AbstractSystem):
         raise TypeError(f"`system` must be an `enerjax.System`, got {type(system)}.")
-    check_not_mixed((system, state, args, t))
+    check_not_varying((system, state, args, t))
     if not isinstance(state, State):
         raise TypeError(
             f"The start must be an `enerjax.State(q, v)`, got {type(state)}. "
@@ -58,18 +58,21 @@ def check_system(
     return state, args
 
 
-def check_not_mixed(tree: Any) -> None:
-    """A derivative by what is the same on all devices would be summed over them."""
-    kinds = [jax.typeof(x) for x in jax.tree.leaves(tree) if isinstance(x, jax.Array)]
-    # Since JAX 0.10 a part of what it has been before.
-    parts = [getattr(kind, "manual_axis_type", None) for kind in kinds]
-    if any(getattr(kind, "vma", None) for kind in kinds) or any(
-        getattr(part, "varying", None) for part in parts
+def check_not_varying(tree: Any) -> None:
+    """Raises an error if numbers vary over the devices of a checked `jax.shard_map`.
+
+    There JAX sums a derivative with respect to a number that does not vary over all
+    devices.
+    """
+    types = [jax.typeof(x) for x in jax.tree.leaves(tree) if isinstance(x, jax.Array)]
+    # The first form is that of JAX before 0.10.
+    if any(getattr(x, "vma", None) for x in types) or any(
+        getattr(getattr(x, "manual_axis_type", None), "varying", None) for x in types
     ):
         raise ValueError(
             "These numbers differ from device to device inside `jax.shard_map`, where JAX "
-            "would sum the derivatives that make the step equations over the devices. Pass "
-            "`check_vma=False` to `shard_map`, or use `sweep`, which takes all devices."
+            "would sum the derivatives in the step equations over the devices. Pass "
+            "`check_vma=False` to `shard_map`, or use `sweep`, which uses all devices."
         )
 
 
@@ -77,8 +80,8 @@ def check_not_mixed(tree: Any) -> None:
 def _warn_single_precision() -> None:
     warnings.warn(
         "This run is in float32: energies and constraints hold to about 1e-6 instead of "
-        "1e-15, and Newton's tolerances follow. For double precision run "
-        '`jax.config.update("jax_enable_x64", True)` before the first array is made.',
+        "1e-15, and Newton's method uses looser tolerances. For double precision run "
+        '`jax.config.update("jax_enable_x64", True)` before the first array is created.',
         stacklevel=5,
     )
 
@@ -89,17 +92,18 @@ def check_number(name: str, x: Any) -> None:
 
 
 def _check_precision(args: Args, dtype: Any) -> None:
-    """Arrays of another precision would lose digits, or feign them, step by step."""
+    """Raises an error for arrays of another precision than the start, whose results would
+    have fewer digits than their dtype suggests."""
     for path, x in jax.tree_util.tree_leaves_with_path(args):
         if eqx.is_inexact_array(x) and not jnp.iscomplexobj(x) and x.dtype != dtype:
             raise TypeError(
                 f"`args{jax.tree_util.keystr(path)}` is {x.dtype} and the start is {dtype}"
-                ": give both one dtype. (Python floats take that of the start.)"
+                ": give both one dtype. (Python floats get that of the start.)"
             )
 
 
 def _as_array(x: Any, dtype: Any) -> Any:
-    """Python floats become arrays: as they are, each new value would recompile."""
+    """Python floats become arrays, because each new Python float would recompile."""
     if isinstance(x, float | np.floating):
         return jnp.asarray(x, dtype)
     return jnp.asarray(x) if isinstance(x, np.ndarray) else x

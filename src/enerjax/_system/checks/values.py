@@ -1,4 +1,4 @@
-"""Whether the numbers of a system make sense: finite energies, a regular inertia."""
+"""Checks of the values of a system: finite energies, a regular inertia."""
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ from .shapes import describe, energies
 
 
 def direction_without_symmetry(x: Float[Array, " n"]) -> Float[Array, " n"]:
-    """A direction in which what depends on `x` is unlikely to stay as it is."""
+    """A direction along which a function that depends on `x` is unlikely to be constant."""
     return 1 + 0.5 * jnp.cos(jnp.arange(x.size, dtype=x.dtype))
 
 
@@ -33,10 +33,10 @@ def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]
     if isinstance(system, System):
         constraints.append(system.coordinate_constraint)
     potential = lambda q: system.potential_energy(State(q, jnp.zeros_like(state.v)), args)
-    held = [lambda q, fn=fn: fn(q, args) for fn in constraints if fn is not None]
+    rows_of = [lambda q, fn=fn: fn(q, args) for fn in constraints if fn is not None]
     # A row that depends on `q` changes along this direction.
     along = direction_without_symmetry(state.q)
-    rates = [jax.jvp(fn, (state.q,), (along,))[1] for fn in held]
+    rates = [jax.jvp(fn, (state.q,), (along,))[1] for fn in rows_of]
     slopes = jnp.concatenate([jnp.zeros((0,), state.q.dtype), *rates])
     timed, t = [], state.t
     if system.force is not None and t is not None:
@@ -67,7 +67,7 @@ def _is_quadratic(
         return jnp.array(True)
     v = state.v
     energy = lambda v: system.kinetic_energy(State(state.q, v), args)
-    # A probe with no symmetry, of the size of the velocities.
+    # The probe has no symmetry, and is as large as the velocities.
     probe = (1 + jnp.max(jnp.abs(v))) * jnp.cos(jnp.arange(1, v.size + 1, dtype=v.dtype))
     quadratic = 0.5 * probe @ inertia @ probe
     error = jnp.abs(energy(probe) - quadratic) + jnp.abs(energy(-probe) - quadratic)
@@ -76,9 +76,9 @@ def _is_quadratic(
 
 
 def check_values(system: AbstractSystem, state: State, args: Args) -> None:
-    """Raises for the first number of a system that makes no sense, if it is known."""
+    """Raises an error for the first condition that the values of a system violate."""
     facts = _facts(system, state, args)
-    if not is_known(facts):  # the functions of the system close over traced numbers
+    if not is_known(facts):  # the functions of the system close over tracers
         return
     functions = {role: describe(role, fn) for role, fn, _ in energies(system, state, args)}
     kinetic = functions.get("kinetic", functions.get("hamiltonian"))
@@ -92,7 +92,7 @@ def check_values(system: AbstractSystem, state: State, args: Args) -> None:
 
 
 def _messages_of_start(potential: str | None, state: State, args: Args) -> dict[str, str]:
-    """What to say where the start, a force, a potential or a constraint makes no sense."""
+    """The messages about the start, forces, potential and constraints."""
     return {
         "start": f"The start is not finite: q = {state.q}, v = {state.v}.",
         "args": f"`args` holds a number that is not finite: {args}.",
@@ -105,8 +105,8 @@ def _messages_of_start(potential: str | None, state: State, args: Args) -> dict[
         ),
         "slope": (
             f"The slope of {potential} is not finite at the start, q = {state.q}. It must "
-            "be differentiable there: the norm of a vector that vanishes is not, nor the "
-            "root of zero."
+            "be differentiable there: the norm of a zero vector is not, nor the root of "
+            "zero."
         ),
         "constraint": "The constraints are not finite at the start. Defined there?",
         "slopes": (
@@ -115,13 +115,13 @@ def _messages_of_start(potential: str | None, state: State, args: Args) -> dict[
         ),
         "depends": (
             "A row of the constraints does not depend on `q` at the start: is it constant, "
-            "or the square of what vanishes?"
+            "or a square that vanishes there?"
         ),
     }
 
 
 def _messages_of_inertia(system: AbstractSystem, kinetic: str | None) -> dict[str, str]:
-    """What to say where the inertia makes no sense."""
+    """The messages about the inertia."""
     inertia, missing = "inertia matrix", "A coordinate without mass, or a negative mass?"
     not_smooth = (
         " A kinetic energy must have second derivatives at `v = 0`: write `v @ v`, not the "

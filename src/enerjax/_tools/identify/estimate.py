@@ -1,4 +1,4 @@
-"""What a fit finds, and how well it is known."""
+"""The estimate of a fit and its uncertainty."""
 
 import math
 from typing import Any
@@ -19,21 +19,22 @@ CONFIDENCE = 0.95
 
 
 class Fit(eqx.Module):
-    """Estimated parameters, and how well the data tells them.
+    """Estimated parameters and their uncertainty.
 
     - `parameters`: the estimate, a pytree like the guess.
-    - `standard_errors`: of each parameter, the same pytree; infinite where the data says
-      nothing, alone or together with others.
-    - `lower`, `upper`: the ends of its 95 % confidence interval (Student's t), from the
-      linearisation at the estimate; of positive parameters in their logarithm.
+    - `standard_errors`: of each parameter, the same pytree; infinite if the data do not
+      determine the parameter.
+    - `lower`, `upper`: the ends of the 95 % confidence intervals (Student's t), from the
+      linearisation at the estimate; those of positive parameters use their logarithm.
     - `covariance`: of all parameters in the order of `names`, shape `(n, n)`.
     - `cost`: the sum of the squares of the residuals.
-    - `degrees_of_freedom`: residuals less parameters.
-    - `iterations`: of the solver, steps that were rejected included.
-    - `simulations`: evaluations of the residuals, of their derivative by one parameter, and
-      (by minimisers) of a gradient; those at the end for the covariance included.
+    - `degrees_of_freedom`: the number of residuals less that of parameters.
+    - `iterations`: of the solver, including rejected steps.
+    - `simulations`: the number of evaluations of the residuals, of their derivative with
+      respect to one parameter, and (for minimisers) of a gradient; including those for the
+      covariance.
     - `result`: `optimistix.RESULTS.successful`, or why the solver stopped.
-    - `names`: of the parameters, from their place in the pytree.
+    - `names`: of the parameters, from their path in the pytree.
 
     `print` shows a table.
     """
@@ -72,7 +73,7 @@ class Fit(eqx.Module):
 
 
 class Unknowns(eqx.Module):
-    """Parameters as one vector, the logarithms of those that are positive."""
+    """Parameters as one vector, with the logarithms of positive ones."""
 
     positive: Array
     unravel: Any = eqx.field(static=True)
@@ -81,7 +82,7 @@ class Unknowns(eqx.Module):
         return self.unravel(self.numbers(x))
 
     def numbers(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        # Of others no exponential is taken: it may overflow, with a derivative of NaN.
+        # The exponential of another parameter could overflow; its derivative would be NaN.
         return jnp.where(self.positive, jnp.exp(jnp.where(self.positive, x, 0)), x)
 
     def vector(self, numbers: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -90,7 +91,7 @@ class Unknowns(eqx.Module):
         )
 
     def slopes(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Of the numbers by the unknowns."""
+        """The derivatives of the parameters with respect to the unknowns."""
         return jnp.where(self.positive, self.numbers(x), 1)
 
 
@@ -102,13 +103,13 @@ def covariance(
     scale = jnp.where(size > 0, size, 1)
     _, values, directions = jnp.linalg.svd(jacobian / scale[None], full_matrices=False)
     eps = jnp.finfo(jacobian.dtype).eps
-    # Derivatives of a run have about this accuracy, whatever their size.
-    silent = values <= jnp.sqrt(eps) * values[0]
-    unseen = jnp.sum(jnp.where(silent[:, None], directions**2, 0), axis=0)
-    weak = (unseen > jnp.sqrt(eps)) | (size == 0)
-    inverse = jnp.where(silent, 0, 1 / jnp.where(silent, 1, values))
+    # Derivatives of a run are accurate to about half the digits.
+    is_null = values <= jnp.sqrt(eps) * values[0]
+    in_null_space = jnp.sum(jnp.where(is_null[:, None], directions**2, 0), axis=0)
+    undetermined = (in_null_space > jnp.sqrt(eps)) | (size == 0)
+    inverse = jnp.where(is_null, 0, 1 / jnp.where(is_null, 1, values))
     root = directions.T * inverse[None] / scale[:, None]
-    return variance * root @ root.T, weak
+    return variance * root @ root.T, undetermined
 
 
 def student(degrees_of_freedom: int) -> float:
@@ -121,7 +122,7 @@ def names_of(parameters: PyTree[Any]) -> tuple[str, ...]:
     names = []
     for path, leaf in jax.tree_util.tree_flatten_with_path(parameters)[0]:
         name = jax.tree_util.keystr(path, simple=True, separator=".") or "parameter"
-        places = np.ndindex(np.shape(leaf))
-        names += [f"{name}{list(k)}" if k else name for k in places]
+        indices = np.ndindex(np.shape(leaf))
+        names += [f"{name}{list(k)}" if k else name for k in indices]
     assert len(names) == sum(math.prod(np.shape(x)) for x in jax.tree.leaves(parameters))
     return tuple(names)

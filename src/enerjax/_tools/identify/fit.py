@@ -1,5 +1,5 @@
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -8,17 +8,19 @@ import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
+from typing_extensions import TypeAliasType
 
 from ..._programs import is_known
 from ..._run import positive_integer
 from .estimate import covariance, Fit, names_of, student, Unknowns
 
 
-Solver: TypeAlias = optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser
+Residuals = TypeAliasType("Residuals", Callable[[Any, Any], PyTree[Array]])
+Solver = TypeAliasType("Solver", optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser)
 
 
 def fit(
-    residuals: Callable[[Any, Any], PyTree[Array]],
+    residuals: Residuals,
     guess: PyTree[Any],
     data: PyTree[Any] = None,
     *,
@@ -27,7 +29,7 @@ def fit(
     max_steps: int = 256,
     throw: bool = True,
 ) -> Fit:
-    """Parameters of a model from data, by least squares, with their confidence intervals.
+    """Fits parameters of a model to data by least squares, with confidence intervals.
 
         def residuals(parameters, data):
             start = ej.State(jnp.stack([parameters["l"], 0.0]), [0.0, 0.0])
@@ -38,34 +40,32 @@ def fit(
 
         print(ej.fit(residuals, {"m": 1.0, "l": 0.8}, measured, positive=True))
 
-    Derivatives go through whole runs, constraints, rotations and dampers included. A step
-    to where a run fails is taken back: make runs with `throw=False`, and starts that are
-    known as functions of the parameters without `initial_state`, which raises an error for
-    lengths that are far off. Under `jit` and `vmap` all works with `throw=False`; and in
-    `sweep`, over several guesses:
+    The residuals may contain whole runs, with constraints, rotations and dampers. The
+    solver rejects a step to parameters for which a run fails, so use `throw=False` in runs
+    and in `initial_state`. With `throw=False` the fit itself works under `jit` and `vmap`,
+    and in a `sweep` over several guesses:
 
         fits = ej.sweep(lambda **guess: ej.fit(residuals, guess, data, throw=False), over)
         fits.smallest("cost").values
 
-    Runs that are long against the time in which the motion forgets its start (chaos) have
-    a cost of many minima: see `MultipleShooting`.
+    For long chaotic runs the cost has many local minima: see `MultipleShooting`.
 
     **Arguments:**
 
     - `residuals`: a function of the parameters and the data that returns a pytree of
-      arrays, what the model says less what was measured: positions, angles, energies. All
-      residuals should have one standard deviation, so divide those of each kind by its
-      own; what it is in common is estimated.
+      arrays: the prediction of the model less the measurement, of positions, angles or
+      energies. Divide residuals of each kind by their standard deviation up to a common
+      factor; this factor is estimated.
     - `guess`: of the parameters, a pytree of numbers.
-    - `data`: handed to `residuals`; new data of the same shape compiles nothing.
+    - `data`: passed to `residuals`; new data of the same shape does not recompile.
     - `positive`: which parameters are positive, a pytree of flags like `guess`, or one
-      flag for a part of it. Their logarithms are sought.
-    - `solver`: of optimistix, for least squares or a minimiser such as `optimistix.BFGS`
-      (which takes reverse derivatives: fewer runs where parameters are many). Its
-      tolerances ask for no more than noisy data can tell.
-    - `max_steps`: of the solver. A positive parameter that the data would rather have
-      at zero, such as a damper that is not there, takes all of them.
-    - `throw`: raise an error for a fit that failed; with `False` look at `result`.
+      flag for a part of it. The fit uses their logarithms.
+    - `solver`: a least-squares solver of optimistix, or a minimiser such as
+      `optimistix.BFGS`, which uses reverse derivatives and needs fewer runs if there are
+      many parameters. The default tolerances suit noisy data.
+    - `max_steps`: of the solver. If the best value of a positive parameter is zero, such as
+      that of a damper that does not exist, the fit takes all of these steps.
+    - `throw`: raise an error if the fit failed; with `False` check `result`.
 
     **Returns:** a `Fit`.
 
@@ -76,11 +76,10 @@ def fit(
 
     **Reference:** G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), chapter 5.
     """
-    if not isinstance(solver, Solver):
+    if not isinstance(solver, Solver.__value__):
         raise TypeError(
-            "`solver` must be one of optimistix for least squares or for minimisation, "
-            "such as `optimistix.LevenbergMarquardt(rtol=1e-6, atol=1e-6)`; got "
-            f"{solver!r}."
+            "`solver` must be a least-squares solver or minimiser of optimistix, such as "
+            f"`optimistix.LevenbergMarquardt(rtol=1e-6, atol=1e-6)`; got {solver!r}."
         )
     max_steps = positive_integer("max_steps", max_steps)
     guess = jax.tree.map(_real, guess)
@@ -89,8 +88,9 @@ def fit(
     unknowns = Unknowns(flags, unravel)
     if is_known(numbers):
         _check_guess(guess, numbers, flags)
-    found, weak = _fit(residuals, unknowns, numbers, data, solver, max_steps, guess)
-    return _raise_failure(found, weak) if throw else found
+    inputs = (residuals, unknowns, numbers, data, solver, max_steps, guess)
+    found, undetermined = _fit(*inputs)
+    return _raise_failure(found, undetermined) if throw else found
 
 
 @eqx.filter_jit
@@ -103,19 +103,21 @@ def _fit(residuals, unknowns, numbers, data, solver, max_steps, guess):
     freedom = count - x0.size
     if freedom < 1:
         raise ValueError(
-            f"`residuals` returned {count} numbers for {x0.size} parameters: to tell how "
-            "well these are known there must be more."
+            f"`residuals` returned {count} numbers for {x0.size} parameters: an estimate "
+            "of their uncertainty needs more."
         )
-    sought = optx.least_squares(vector, solver, x0, data, max_steps=max_steps, throw=False)
-    x = sought.value
-    at = lambda x: (vector(x, data),) * 2
-    jacobian, rest = jax.jacfwd(at, has_aux=True)(x)
-    cost = rest @ rest
-    spread, weak = covariance(jacobian, cost / freedom)
-    error = jnp.where(weak, jnp.inf, jnp.sqrt(jnp.diagonal(spread)))
+    solution = optx.least_squares(
+        vector, solver, x0, data, max_steps=max_steps, throw=False
+    )
+    x = solution.value
+    with_value = lambda x: (vector(x, data),) * 2
+    jacobian, remaining = jax.jacfwd(with_value, has_aux=True)(x)
+    cost = remaining @ remaining
+    spread, undetermined = covariance(jacobian, cost / freedom)
+    error = jnp.where(undetermined, jnp.inf, jnp.sqrt(jnp.diagonal(spread)))
     slopes, half = unknowns.slopes(x), student(freedom) * error
-    iterations = jnp.asarray(sought.stats["num_steps"])
-    each = 2 if isinstance(solver, optx.AbstractMinimiser) else x.size + 1
+    iterations = jnp.asarray(solution.stats["num_steps"])
+    per_step = 2 if isinstance(solver, optx.AbstractMinimiser) else x.size + 1
     found = Fit(
         parameters=unknowns.parameters(x),
         standard_errors=unknowns.unravel(slopes * error),
@@ -124,12 +126,12 @@ def _fit(residuals, unknowns, numbers, data, solver, max_steps, guess):
         covariance=slopes[:, None] * spread * slopes[None],
         cost=cost,
         iterations=iterations,
-        simulations=iterations * each + x.size + 1,
-        result=sought.result,
+        simulations=iterations * per_step + x.size + 1,
+        result=solution.result,
         degrees_of_freedom=freedom,
         names=names,
     )
-    return found, weak
+    return found, undetermined
 
 
 def _real(x: Any) -> Array:
@@ -163,13 +165,13 @@ def _check_guess(guess: PyTree[Array], numbers: Array, flags: Array) -> None:
             )
 
 
-def _raise_failure(found: Fit, weak: Array) -> Fit:
+def _raise_failure(found: Fit, undetermined: Array) -> Fit:
     failed = found.result != optx.RESULTS.successful
-    if not is_known((found, weak)):
+    if not is_known((found, undetermined)):
         return found.result.error_if(found, failed)
     if not np.isfinite(found.cost):
         raise ValueError(
-            "The residuals are not finite where the fit began, or where it ended: a run "
+            "The residuals are not finite at the guess, or at the end of the fit: a run "
             "fails there. Try a run with the parameters of the guess, and a shorter `h`."
         )
     if failed:
@@ -177,12 +179,13 @@ def _raise_failure(found: Fit, weak: Array) -> Fit:
             f"The fit failed after {int(found.iterations)} iterations. "
             f"{optx.RESULTS[found.result]} (`throw=False` returns what it found.)"
         )
-    if np.any(weak):
-        blind = ", ".join(n for n, w in zip(found.names, weak, strict=True) if w)
+    if np.any(undetermined):
+        pairs = zip(found.names, undetermined, strict=True)
+        names = ", ".join(name for name, flag in pairs if flag)
         raise ValueError(
-            f"The residuals do not determine {blind}: a change of these, alone or "
-            "together, changes nothing. (Of a pendulum the mass cannot be seen, of masses "
-            "often their quotient alone.) Keep one at a known value, or measure more. "
-            "(`throw=False` returns the fit.)"
+            f"The residuals do not determine {names}: a change of these, alone or "
+            "together, changes nothing. (The mass of a pendulum does not affect its "
+            "motion, and often only the ratio of two masses does.) Fix one of them at a "
+            "known value, or measure more. (`throw=False` returns the fit.)"
         )
     return found

@@ -1,27 +1,29 @@
-"""Residuals of long runs in pieces."""
+"""Multiple shooting: the residuals of a long run that is divided into windows."""
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
+from typing_extensions import TypeAliasType
 
 from ..._types import Scalar
 
 
-Window: TypeAlias = Callable[[Any, Any, Any], tuple[PyTree[Array], PyTree[Array]]]
+Window = TypeAliasType(
+    "Window", Callable[[Any, Any, Any], tuple[PyTree[Array], PyTree[Array]]]
+)
 
 
 class MultipleShooting(eqx.Module):
-    """The residuals of a run that is cut into windows, for `fit`.
+    """The residuals of a run that is divided into windows, for `fit`.
 
-    In a chaotic motion a small change of a parameter grows, by a factor each second, until
-    the end of the run has nothing to do with the data: the cost of a long run has many
-    minima, and a fit ends in one nearby. Within short windows it has not. So each window
-    begins where it likes; that it does so where the one before ends is asked for by
-    residuals of their own:
+    In a chaotic motion the effect of a small change of a parameter grows exponentially, so
+    the cost of a long run has many local minima. Within short windows it has not. The start
+    of each window is an unknown of the fit, and additional residuals require that each
+    window starts where the one before ends:
 
         def window(parameters, start, data):
             sol = ej.simulate(system, scheme, state_of(start), parameters, ...)
@@ -31,19 +33,19 @@ class MultipleShooting(eqx.Module):
         loose = ej.fit(ej.MultipleShooting(window, 1 / noise), guess, windows)
         tight = ej.fit(ej.MultipleShooting(window, 100 / noise), loose.parameters, windows)
 
-    A function of `{"parameters": ..., "starts": ...}` and the data; starts and data are
-    stacked along a leading axis, a row for each window. Starts and ends of windows are
-    pytrees of independent coordinates and velocities, as many numbers as the motion is
-    free to choose (of a double pendulum its two angles and their rates), since each one is
-    an unknown. Choose windows in which errors of the guess do not grow much.
+    The residuals are a function of `{"parameters": ..., "starts": ...}` and the data;
+    starts and data are stacked along a leading axis, with a row for each window. Starts and
+    ends of windows are pytrees of independent coordinates and velocities (for a double
+    pendulum, its two angles and their rates). Choose windows in which errors of the guess
+    do not grow much.
 
     - `window`: a function of the parameters, the start of a window and its data that
-      returns its residuals, as for `fit`, and where it ends. All windows have the same
-      shapes, and run side by side.
-    - `continuity`: what a gap between two windows is multiplied by. Small, the gaps absorb
-      what a wrong guess leaves over, and the fit finds its way; large, the windows become
-      one run. Begin with the factor of the data, and end with a hundred times that. A new
-      value compiles nothing.
+      returns its residuals, as for `fit`, and its end. All windows have the same shapes,
+      and are run in one batch.
+    - `continuity`: the factor of the gaps between windows. If it is small, gaps absorb the
+      errors of the guess, and the fit converges from further away; if it is large, the
+      windows form one run. First use the factor of the data, then a hundred times that. A
+      new value does not recompile.
 
     **Reference:** H. G. Bock (1983), Recent advances in parameter identification techniques
     for ODE, in: Numerical Treatment of Inverse Problems in Differential Equations.

@@ -1,17 +1,16 @@
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from ...schemes import AbstractScheme
 from .reference import Reals
-from .runs import Given, measure, Problem, Runs
+from .runs import measure, Problem, ReferenceMotion, Runs, Schemes
 from .text import number, with_uncertainty
 
 
 _NAMES = ("q", "v", "multipliers")
-# Rounded sums of many steps resolve no less than this, relative to the errors' own units.
+# Errors below this are round-off, which accumulates over many steps.
 _ROUND_OFF = 1e-12
 
 
@@ -19,12 +18,12 @@ _ROUND_OFF = 1e-12
 class OrderTable:
     """Measured orders of accuracy. Errors have the shape `(schemes, steps)`.
 
-    - `schemes`: their names; `expected`: the orders that they promise, `(schemes,)`.
+    - `schemes`: their names; `expected`: their theoretical orders, `(schemes,)`.
     - `steps`, `h`: numbers of steps and their lengths, shape `(steps,)`, longest first.
     - `q`, `v`, `multipliers`: the largest errors over entries and times.
     - `order_q`, `order_v`, `order_multipliers`: slopes from each length to the next, shape
-      `(schemes, steps - 1)`; NaN where a run failed, and where an error is at the level of
-      round-off or of the uncertainty of the reference.
+      `(schemes, steps - 1)`; NaN if a run failed, or if an error is below round-off or the
+      uncertainty of the reference.
     - `failures`, `uncertainty`: as in `WorkPrecision`.
 
     `print` shows a table.
@@ -73,16 +72,16 @@ class OrderTable:
 
 def order_table(
     problem: Problem,
-    schemes: Mapping[str, AbstractScheme],
+    schemes: Schemes,
     steps: Sequence[int],
-    reference: Given = None,
+    reference: ReferenceMotion = None,
     *,
     duration: float,
     t0: float = 0.0,
 ) -> OrderTable:
-    """The orders that schemes reach on a problem of yours.
+    """Measures the orders of schemes on a problem of yours.
 
-    Arguments, reference, errors and failures as in `work_precision`; nothing is timed.
+    Arguments, reference, errors and failures are those of `work_precision`, without times.
 
     **Returns:** an `OrderTable`.
     """
@@ -90,10 +89,10 @@ def order_table(
     errors = {name: runs.table(name) for name in _NAMES}
     slopes = {f"order_{name}": _slopes(runs, name) for name in _NAMES}
     return OrderTable(
-        tuple(runs.schemes),
-        tuple(scheme.order for scheme in runs.schemes.values()),
-        runs.steps,
-        runs.h,
+        schemes=tuple(runs.schemes),
+        expected=tuple(scheme.order for scheme in runs.schemes.values()),
+        steps=runs.steps,
+        h=runs.h,
         **errors,
         **slopes,
         failures=runs.failures,

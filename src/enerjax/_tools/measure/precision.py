@@ -1,11 +1,10 @@
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from ..._run import positive_integer
-from ...schemes import AbstractScheme
 from .reference import Reals
-from .runs import Given, measure, Problem
+from .runs import measure, Problem, ReferenceMotion, Schemes
 from .text import number, with_uncertainty
 
 
@@ -36,21 +35,21 @@ _HEADER = (
 
 @dataclasses.dataclass(frozen=True)
 class WorkPrecision:
-    """What accuracy costs. Arrays have the shape `(schemes, steps)`, the longest first.
+    """The costs of accuracy. Arrays have the shape `(schemes, steps)`, longest step first.
 
     - `schemes`: their names.
     - `steps`, `h`: numbers of steps and their lengths, shape `(steps,)`.
     - `q`, `v`, `multipliers`: the largest errors over entries and times.
     - `energy`: the largest change of the energy; with forces or drives its largest error.
     - `constraint`, `constraint_rate`: the largest residuals.
-    - `evaluations`: corrections of Newton's method, of the whole run.
-    - `seconds`: of the processor, for a run that is compiled; the median of the repeats.
-    - `failures`: why a run has no numbers; empty for the others.
-    - `uncertainty`: of the reference, for `q`, `v` and `multipliers`; errors below it
-      mean nothing. 0 for given data.
+    - `evaluations`: the number of Newton corrections in the whole run.
+    - `seconds`: processor time of a compiled run; the median of the repeats.
+    - `failures`: why a run failed; empty for all others.
+    - `uncertainty`: of the reference, for `q`, `v` and `multipliers`; smaller errors are
+      meaningless. 0 if the reference is data.
 
-    NaN stands where a run failed, where the reference says nothing, and for constraints
-    and multipliers that a system does not have. `print` shows a table.
+    Entries are NaN if a run failed, if the reference does not contain them, and for
+    constraints and multipliers that a system does not have. `print` shows a table.
     """
 
     schemes: tuple[str, ...]
@@ -97,33 +96,33 @@ class WorkPrecision:
 
 def work_precision(
     problem: Problem,
-    schemes: Mapping[str, AbstractScheme],
+    schemes: Schemes,
     steps: Sequence[int],
-    reference: Given = None,
+    reference: ReferenceMotion = None,
     *,
     duration: float,
     t0: float = 0.0,
     repeats: int = 5,
 ) -> WorkPrecision:
-    """How accurate schemes are on a problem of yours, and what that costs.
+    """Measures how accurate schemes are on a problem of yours, and what that costs.
 
     **Arguments:**
 
-    - `problem`: `(system, start, args)`, as of `problems` and `Scene.build()`.
+    - `problem`: `(system, start, args)`, such as those of `problems` and `Scene.build()`.
     - `schemes`: a dictionary of names and schemes.
     - `steps`: numbers of steps into which the duration is divided.
-    - `reference`: data `(t, q)` or `(t, q, v)` of your own, with q of shape
-      `(times, nq)`, at times that all runs pass; or a scheme, of which two runs finer than
-      all others are extrapolated (Richardson). Left out, that is done with
-      `Composed(EnergyPreserving(), 6)`, or `EnergyPreserving()` where the system has
-      forces, at quarters of the duration (at its end where `steps` are no multiples of 4).
+    - `reference`: either data `(t, q)` or `(t, q, v)`, with q of shape `(times, nq)`, at
+      times that are ends of steps in all runs; or a scheme, of which two finer runs are
+      extrapolated (Richardson). The default is `Composed(EnergyPreserving(), 6)`, or
+      `EnergyPreserving()` if the system has forces. A scheme is compared at quarters of the
+      duration (only at its end if some of `steps` are not multiples of 4).
     - `duration`: of every run (time).
     - `t0`: the time of the start.
-    - `repeats`: timed runs of each kind, after one that compiles.
+    - `repeats`: the number of timed runs of each kind, after one that compiles.
 
-    Multipliers are those that a run reports, against those of the reference at the same
-    time: schemes that report the mean over a step are off by half a step there. A scheme
-    that refuses the system, and a run that fails, leave a row that says so.
+    The multipliers of a run are compared with those of the reference at the same time, so
+    schemes that report means over a step have an error of half a step there. The row of a
+    scheme that refuses the system, or of a failed run, contains the reason.
 
     **Returns:** a `WorkPrecision`.
 
@@ -137,9 +136,9 @@ def work_precision(
     runs = measure(problem, schemes, steps, reference, duration, t0, repeats)
     numbers = {name: runs.table(name) for name in _COLUMNS}
     return WorkPrecision(
-        tuple(runs.schemes),
-        runs.steps,
-        runs.h,
+        schemes=tuple(runs.schemes),
+        steps=runs.steps,
+        h=runs.h,
         **numbers,
         failures=runs.failures,
         uncertainty=runs.uncertainty,

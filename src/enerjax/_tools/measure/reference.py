@@ -1,4 +1,4 @@
-"""What errors are measured against."""
+"""The reference motions that errors are measured against."""
 
 import dataclasses
 import math
@@ -19,13 +19,13 @@ from ...schemes import AbstractScheme, Composed, EnergyPreserving
 
 
 Reals: TypeAlias = NDArray[np.floating[Any]]
-# Steps of the two runs behind a reference, against those of the finest run measured.
+# The two runs of a reference have so many times the steps of the finest measured run.
 _FINER = (2, 4)
 
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """A motion of some duration, whose errors are asked for at some times."""
+    """A motion, and the times at which errors are measured."""
 
     system: AbstractSystem
     start: State
@@ -35,23 +35,23 @@ class Task:
     times: Reals
 
     def rows(self, num_steps: int) -> tuple[int, NDArray[np.int_]]:
-        """After how many steps a run saves that passes all times, and its rows there."""
+        """The number of steps between saved rows, and the rows at the times of the task."""
         counts = num_steps * (self.times - self.t0) / self.duration
         whole = np.rint(counts).astype(int)
-        # A time between steps would be measured against an interpolant.
+        # Between steps the error of an interpolant would be measured.
         missed = (np.abs(counts - whole) > 1e-6) | (whole < 1) | (whole > num_steps)
         if missed.any():
             time = self.times[missed][0]
             raise ValueError(
-                f"A run of {num_steps} steps from {self.t0:g} over {self.duration:g} does "
-                f"not pass t = {time:g}, where the reference is given. Leave this time "
-                "out, or choose numbers of steps of which one ends there."
+                f"No step of a run of {num_steps} steps from {self.t0:g} over "
+                f"{self.duration:g} ends at t = {time:g}, a time of the reference. Leave "
+                "this time out, or choose other numbers of steps."
             )
         every = math.gcd(num_steps, *whole.tolist())
         return every, whole // every
 
     def run(self, scheme: AbstractScheme, num_steps: int) -> Solution:
-        """A run of a compiled program; a failure is left in its `result`."""
+        """A run; its `result` tells whether it failed."""
         h = jnp.asarray(self.duration / num_steps, self.start.q.dtype)
         t0 = jnp.asarray(self.t0, h.dtype)
         every, _ = self.rows(num_steps)
@@ -86,7 +86,7 @@ def _run(
 
 @dataclasses.dataclass(frozen=True)
 class Values:
-    """Numbers of a motion at the times of a task; NaN where nothing is known."""
+    """A motion at the times of a task; unknown entries are NaN."""
 
     q: Reals
     v: Reals
@@ -96,9 +96,9 @@ class Values:
 
 @dataclasses.dataclass(frozen=True)
 class Reference:
-    """The motion that errors are measured against, and how well it is known.
+    """The motion that errors are measured against, and its uncertainty.
 
-    The uncertainties are the changes by the last extrapolation; 0 for given data.
+    The uncertainty is the change by the extrapolation; 0 for data.
     """
 
     values: Values
@@ -106,7 +106,7 @@ class Reference:
 
 
 def extrapolated(task: Task, finest: int, scheme: AbstractScheme | None) -> Reference:
-    """Two runs finer than the finest measured, extrapolated to `h = 0` (Richardson)."""
+    """The extrapolation to `h = 0` of two runs with shorter steps (Richardson)."""
     forced = task.system.force is not None
     if scheme is None:
         scheme = EnergyPreserving() if forced else Composed(EnergyPreserving(), 6)
@@ -152,8 +152,8 @@ def _balance(system: AbstractSystem, states: State, args: Args):
     return jax.vmap(at)(states)
 
 
-def given(task: Task, q: Reals, v: Reals | None) -> Reference:
-    """From the user's own data."""
+def from_data(task: Task, q: Reals, v: Reals | None) -> Reference:
+    """The reference that consists of a user's data."""
     if v is None:
         # Without velocities only positions can be compared.
         unknown = np.full((len(q), 1), np.nan)

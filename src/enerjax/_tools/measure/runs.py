@@ -1,30 +1,34 @@
-"""Runs of several schemes at several steps: errors, evaluations and times."""
+"""Runs of several schemes with several step lengths: errors, evaluations and times."""
 
 import dataclasses
 import math
 import statistics
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from jaxtyping import ArrayLike
+from typing_extensions import TypeAliasType
 
 from ..._results import meanings, RESULTS
 from ..._run import positive_integer, Solution
 from ..._system import AbstractSystem, check_system, State
 from ..._types import Args
 from ...schemes import AbstractScheme
-from .reference import extrapolated, given, Reals, Reference, Task, Values
+from .reference import extrapolated, from_data, Reals, Reference, Task, Values
 
 
-Problem: TypeAlias = tuple[AbstractSystem, State, Args]
-Given: TypeAlias = AbstractScheme | Sequence[ArrayLike] | None
+Problem = TypeAliasType("Problem", tuple[AbstractSystem, State, Args])
+Schemes = TypeAliasType("Schemes", Mapping[str, AbstractScheme])
+ReferenceMotion = TypeAliasType(
+    "ReferenceMotion", AbstractScheme | Sequence[ArrayLike] | None
+)
 
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """One run; its numbers are NaN where it failed, and where there is nothing to know."""
+    """The measurements of one run; those that are not known are NaN."""
 
     q: float = math.nan
     v: float = math.nan
@@ -48,7 +52,7 @@ class Runs:
     uncertainty: dict[str, float]
 
     def table(self, name: str) -> Reals:
-        """One number of all runs, shape `(schemes, steps)`."""
+        """One measurement of all runs, shape `(schemes, steps)`."""
         return np.array([[getattr(r, name) for r in runs] for runs in self.runs.values()])
 
     @property
@@ -58,9 +62,9 @@ class Runs:
 
 def measure(
     problem: Problem,
-    schemes: Mapping[str, AbstractScheme],
+    schemes: Schemes,
     steps: Sequence[int],
-    reference: Given,
+    reference: ReferenceMotion,
     duration: float,
     t0: float,
     repeats: int,
@@ -82,14 +86,14 @@ def measure(
     )
     for count in counts:
         task.rows(count)
-    known = _known(task, reference, data, counts[-1])
+    exact = _reference(task, reference, data, counts[-1])
     runs = {
-        name: [_run(task, known.values, scheme, n, repeats) for n in counts]
+        name: [_run(task, exact.values, scheme, n, repeats) for n in counts]
         for name, scheme in schemes.items()
     }
     h = duration / np.array(counts)
     return Runs(
-        schemes=dict(schemes), steps=counts, h=h, runs=runs, uncertainty=known.uncertainty
+        schemes=dict(schemes), steps=counts, h=h, runs=runs, uncertainty=exact.uncertainty
     )
 
 
@@ -105,11 +109,11 @@ def _check(schemes: Any, duration: float) -> None:
 
 
 def _times(
-    reference: Given, counts: tuple[int, ...], duration: float, t0: float
+    reference: ReferenceMotion, counts: tuple[int, ...], duration: float, t0: float
 ) -> tuple[Reals, list[Reals]]:
-    """When errors are taken, and the data that is given there."""
+    """The times at which errors are measured, and the user's data at these times."""
     if reference is None or isinstance(reference, AbstractScheme):
-        # Four times where all runs pass them: at one alone an error may happen to vanish.
+        # If possible there are four times: at a single one an error may vanish by chance.
         parts = math.gcd(4, *counts)
         return t0 + duration * np.arange(1, parts + 1) / parts, []
     data = [np.asarray(x, float) for x in reference]
@@ -122,7 +126,9 @@ def _times(
     return times, [np.atleast_2d(x) for x in data[1:]]
 
 
-def _known(task: Task, reference: Given, data: list[Reals], finest: int) -> Reference:
+def _reference(
+    task: Task, reference: ReferenceMotion, data: list[Reals], finest: int
+) -> Reference:
     if not data:
         scheme = reference if isinstance(reference, AbstractScheme) else None
         return extrapolated(task, finest, scheme)
@@ -133,13 +139,13 @@ def _known(task: Task, reference: Given, data: list[Reals], finest: int) -> Refe
                 f"times and {like.size} entries of `{name}` in the start need "
                 f"({task.times.size}, {like.size})."
             )
-    return given(task, data[0], data[1] if len(data) == 2 else None)
+    return from_data(task, data[0], data[1] if len(data) == 2 else None)
 
 
 def _run(
     task: Task, exact: Values, scheme: AbstractScheme, num_steps: int, repeats: int
 ) -> Run:
-    # The first call compiles. What a scheme is not defined for it refuses there; the
+    # The first call compiles. A `ValueError` means that the scheme refuses the system: the
     # system itself has passed its checks.
     try:
         solution = task.run(scheme, num_steps)
@@ -167,7 +173,7 @@ def _errors(
         at(solution.ys.q) - exact.q,
         at(solution.ys.v) - exact.v,
         at(solution.multipliers) - exact.multipliers,
-        # What is conserved is known better than any reference.
+        # A conserved energy is known better than that of any reference.
         at(energy) - exact.energy if task.system.is_timed else energy - energy[0],
         np.asarray(audit.constraint),
         np.asarray(audit.constraint_rate),

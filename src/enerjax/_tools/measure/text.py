@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of cells, the first a header, in columns of equal width."""
+    """Rows of cells, of which the first is a header, in aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     line = lambda cells: "  ".join(
         cell.ljust(width) for cell, width in zip(cells, widths, strict=True)
@@ -14,11 +14,11 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
 
 
 def with_uncertainty(rows: Sequence[Sequence[str]], uncertainty: dict[str, float]) -> str:
-    """A table of errors, and how well their reference is known."""
+    """A table of errors, followed by the uncertainty of the reference."""
     known = ", ".join(f"{name} {number(u)}" for name, u in uncertainty.items())
     return f"{aligned(rows)}\nuncertainty of the reference: {known}"
 
 
 def number(x: float) -> str:
-    """An error in two digits; nothing where it is not known."""
+    """An error with two digits; empty if it is not known."""
     return "" if x != x else f"{x:.1e}"

@@ -1,4 +1,4 @@
-"""Counterparts of the figures of the paper, under its numbers."""
+"""Counterparts of the figures of the paper, with the same numbers."""
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -16,7 +16,7 @@ KAPPA = "decaying kappa"
 
 
 def _cartesian(run: Run) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and velocities in the plane; case a is given by its angle."""
+    """Positions and velocities in the plane; those of case a follow from its angle."""
     q, v = np.asarray(run.solution.ys.q), np.asarray(run.solution.ys.v)
     if run.case.name != "a":
         return q, v

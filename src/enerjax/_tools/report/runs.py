@@ -1,4 +1,4 @@
-"""What the main job runs: every scheme on every case of the paper."""
+"""The runs of the main job: every scheme on every case of the paper."""
 
 import dataclasses
 import time
@@ -23,7 +23,7 @@ from ...schemes import (
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A test case of the paper with its step."""
+    """A test case of the paper with its step length."""
 
     name: str
     problem: Callable[[], problems.Problem]
@@ -37,13 +37,13 @@ class Case:
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """A scheme as the table names it."""
+    """A scheme under the name that it has in the table."""
 
     name: str
     alpha: float | None
     scheme: Callable[[], AbstractScheme]
-    # Case d whips the light mass around: where a step has no solution on the branch of the
-    # motion it is divided, and the table tells how many were.
+    # The light mass of case d whips around: a step without a solution near the motion is
+    # divided, and the table contains the number of such steps.
     max_halvings: int = 0
 
     @property
@@ -53,7 +53,7 @@ class Method:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """A finished run, and the time that a step took."""
+    """A finished run, and the time of a step."""
 
     case: Case
     method: Method
@@ -71,7 +71,7 @@ class Run:
 
 
 def cases(quick: bool) -> list[Case]:
-    """Cases c and d share their shapes, so equal numbers of steps share one program."""
+    """All cases. Runs of c and d with equal numbers of steps share one program."""
     part = 10 if quick else 1
     return [
         Case("a", problems.pendulum_angle, 0.02, 500 // part),
@@ -83,7 +83,7 @@ def cases(quick: bool) -> list[Case]:
 
 
 def methods(quick: bool) -> list[list[Method]]:
-    """The schemes, in groups that differ in alpha alone and so share one program."""
+    """The schemes, in groups that differ only in alpha and share one program."""
     three = (0.0, 0.5, 1.0)
     composed = [(EnergyPreserving(), 4)]
     if not quick:
@@ -112,12 +112,12 @@ def _composed_name(scheme: AbstractScheme, order: int) -> str:
 
 
 def _applies(method: Method, case: Case) -> bool:
-    # Without constraints the formulations are one scheme, listed once.
+    # Without constraints both formulations are the same scheme.
     return case.name != "a" or method.name.split()[-1] not in ("GGL", "kappa")
 
 
 def run_all(quick: bool, progress: Callable[[str], None]) -> list[Run]:
-    """Runs everything: first compiled two at a time, then timed one by one."""
+    """All runs, which are compiled two at a time, and then timed one by one."""
     groups = []
     for family in methods(quick):
         by_program: dict[str, list[tuple[Case, Method]]] = {}
@@ -161,7 +161,7 @@ def _first_runs(group: list[tuple[Case, Method]]) -> list[tuple[Case, Method, So
 
 
 def _time(case: Case, method: Method) -> float:
-    """Wall time of a compiled run."""
+    """The wall time of a compiled run."""
 
     def once() -> float:
         begin = time.perf_counter()
@@ -176,7 +176,7 @@ def curves(runs: list[Run]) -> "Lookup":
 
 
 class Lookup:
-    """The runs by case, step, scheme and alpha; those not made are simply missing."""
+    """Finds runs by case, step length, scheme and alpha."""
 
     def __init__(self, runs: dict[tuple, Run]):
         self._runs = runs

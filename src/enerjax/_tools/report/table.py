@@ -1,4 +1,4 @@
-"""The table of the main job: one row a run, as text and as CSV."""
+"""The table of the main job, with one row for each run, as text and as CSV."""
 
 import csv
 from pathlib import Path
@@ -6,7 +6,14 @@ from pathlib import Path
 import numpy as np
 
 from ..._results import meanings
+from ..measure.text import aligned
 from .runs import Run
+
+
+# A run locks if its positions move by less than the first fraction of the way that the
+# velocities promise; its velocities oscillate if they move by less than the second.
+_LOCKED = 0.05
+_OSCILLATING = 0.5
 
 
 HEADER = (
@@ -26,7 +33,7 @@ HEADER = (
 
 
 def row(run: Run) -> tuple[str, ...]:
-    """One run, over the steps that it completed."""
+    """The row of a run, for the steps that it completed."""
     audit, stats = run.solution.audit, run.solution.stats
     energy = np.asarray(audit.energy)[run.rows]
     largest = lambda x: np.abs(np.asarray(x)[run.rows]).max(initial=0.0)
@@ -54,16 +61,16 @@ def outcome(run: Run) -> str:
         done = int(run.solution.stats.completed_steps)
         cause = meanings(run.solution.result)
         return f"failed in step {done + 1} (t = {done * run.case.h:.4g}): {cause}"
-    followed = _followed(run)
-    if followed < 0.05:
+    fraction = _distance_over_promised(run)
+    if fraction < _LOCKED:
         return "done, but LOCKS: at full speed the positions stand still"
-    if followed < 0.5:
+    if fraction < _OSCILLATING:
         return "done, but the velocities oscillate about the motion"
     return "done"
 
 
-def _followed(run: Run) -> float:
-    """In the last tenth of a run, the way made over that which the speeds promise."""
+def _distance_over_promised(run: Run) -> float:
+    """The distance travelled in the last tenth of a run, over that by the velocities."""
     q, v = np.asarray(run.solution.ys.q), np.asarray(run.solution.ys.v)
     last = max(len(q) // 10, 2)
     promised = run.case.h * np.abs(v[-last:]).sum()
@@ -71,13 +78,7 @@ def _followed(run: Run) -> float:
 
 
 def as_text(runs: list[Run]) -> str:
-    rows = [HEADER, *(row(run) for run in runs)]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    line = lambda cells: "  ".join(
-        cell.ljust(w) for cell, w in zip(cells, widths, strict=True)
-    ).rstrip()
-    ruler = "  ".join("-" * w for w in widths)
-    return "\n".join([line(rows[0]), ruler, *map(line, rows[1:])])
+    return aligned([HEADER, *(row(run) for run in runs)])
 
 
 def write_csv(runs: list[Run], path: Path) -> None:

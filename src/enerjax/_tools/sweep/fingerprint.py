@@ -1,26 +1,39 @@
-"""What tells one sweep from another: only the same one is resumed."""
+"""Fingerprints of sweeps, by which a folder of results is recognised, and checksums."""
 
 import enum
 import hashlib
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from .checksums import add_array, checksum
 from .grid import Grid
 
 
+def checksum(arrays: Iterable[Any]) -> str:
+    """One word for the content of some arrays."""
+    word = hashlib.sha256()
+    for array in arrays:
+        _add_array(word, array)
+    return word.hexdigest()
+
+
+def _add_array(word: Any, array: Any) -> None:
+    array = np.ascontiguousarray(array)
+    word.update(repr((array.shape, str(array.dtype))).encode())
+    word.update(array.tobytes())
+
+
 def fingerprint(grid: Grid, chunks: np.ndarray, traced: Any) -> dict[str, str]:
-    """What tells one sweep from another, under the names that a message gives it."""
+    """One word for each property of a sweep that must not change when it is resumed."""
     word = hashlib.sha256(repr((grid.axes, grid.shape)).encode())
     for name, values in grid.values.items():
         word.update(repr((name, str(jax.tree.structure(values)))).encode())
         for x in jax.tree.leaves(values):
-            add_array(word, x)
+            _add_array(word, x)
     order = hashlib.sha256(repr(chunks.shape).encode() + chunks.astype(np.int64).tobytes())
     return {
         "parameters": word.hexdigest(),
@@ -31,9 +44,10 @@ def fingerprint(grid: Grid, chunks: np.ndarray, traced: Any) -> dict[str, str]:
 
 
 def _digest(traced: ClosedJaxpr) -> str:
-    """What a program computes, as one word: the same in every process.
+    """One word for a program, which is the same in every process.
 
-    Its text would not do: it names addresses of functions, and no constants.
+    The text of the program does not suffice: it contains addresses of functions, but no
+    values of constants.
     """
     word = hashlib.sha256()
     _read(traced.jaxpr, traced.consts, lambda *parts: word.update(repr(parts).encode()))
@@ -60,7 +74,7 @@ def _read(jaxpr: Jaxpr, consts: Any, tell: Callable) -> None:
 
 
 def _read_parameter(value: Any, tell: Callable) -> None:
-    """A parameter of an equation; of an object of unknown type only the type."""
+    """Reads a parameter of an equation; of an object of unknown type only the type."""
     tell(type(value).__qualname__)
     if isinstance(value, ClosedJaxpr):
         _read(value.jaxpr, value.consts, tell)
@@ -82,15 +96,15 @@ def _read_parameter(value: Any, tell: Callable) -> None:
     elif isinstance(value, types.FunctionType):
         _read_function(value, tell)
     elif isinstance(getattr(value, "jaxpr", None), Jaxpr):
-        # A program with what belongs to it: one function, say, and the indices it knows.
+        # A program with further attributes, such as indices that are known.
         _read_parameter({k: x for k, x in vars(value).items() if k[0] != "_"}, tell)
     elif callable(getattr(value, "callback_func", None)):
         _read_parameter(value.callback_func, tell)
 
 
 def _read_function(fn: types.FunctionType, tell: Callable) -> None:
-    """A function in Python, such as that of `jax.pure_callback`: its code, and the numbers
-    and texts that it closes over."""
+    """Reads a Python function, such as that of `jax.pure_callback`: its code, and the
+    numbers and strings that it closes over."""
     _read_code(fn.__code__, tell)
     cells = (cell.cell_contents for cell in fn.__closure__ or ())
     for value in (*(fn.__defaults__ or ()), *cells):

@@ -1,4 +1,4 @@
-"""The parameters of a sweep: which values there are, and those of each lane."""
+"""The parameters of a sweep: all values, and those of each lane."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -10,11 +10,11 @@ import numpy as np
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """Lanes in row-major order: the last axis changes from each lane to the next.
+    """All combinations of parameters, one lane each, in row-major order.
 
     - `axes`: the names of the parameters that change together along each axis.
     - `shape`: the number of values along each axis.
-    - `values`: of each parameter, a pytree of arrays with the values in front.
+    - `values`: of each parameter, a pytree of arrays with the values along the first axis.
     """
 
     axes: tuple[tuple[str, ...], ...]
@@ -26,11 +26,11 @@ class Grid:
         return int(np.prod(self.shape))
 
     def lanes(self, numbers: np.ndarray) -> dict[str, Any]:
-        """The parameters of some lanes, in front."""
-        places = np.unravel_index(numbers, self.shape)
+        """The parameters of some lanes, with the lanes along the first axis."""
+        indices = np.unravel_index(numbers, self.shape)
         return {
-            name: jax.tree.map(lambda x, place=place: x[place], self.values[name])
-            for names, place in zip(self.axes, places, strict=True)
+            name: jax.tree.map(lambda x, index=index: x[index], self.values[name])
+            for names, index in zip(self.axes, indices, strict=True)
             for name in names
         }
 
@@ -51,14 +51,14 @@ class Grid:
 
 
 def make_grid(over: Any) -> Grid:
-    """Checked parameters."""
+    """The grid of checked parameters."""
     if not isinstance(over, Mapping) or not over:
         raise TypeError(
             "`over` must be a dictionary of the names of parameters and their values, such "
             f'as {{"alpha": [0.0, 0.5], "h": [1e-3, 2e-3]}}; got {over!r}.'
         )
     axes, shape, values = [], [], {}
-    for key, given in over.items():
+    for key, listed in over.items():
         names = key if isinstance(key, tuple) else (key,)
         if not names or not all(isinstance(name, str) for name in names):
             raise TypeError(
@@ -68,7 +68,7 @@ def make_grid(over: Any) -> Grid:
         if taken:
             raise ValueError(f"`over` has the parameter `{taken[0]}` twice.")
         columns = (
-            _columns(names, given) if isinstance(key, tuple) else (_arrays(key, given),)
+            _columns(names, listed) if isinstance(key, tuple) else (_arrays(key, listed),)
         )
         axes.append(names)
         shape.append(len(jax.tree.leaves(columns)[0]))
@@ -76,9 +76,9 @@ def make_grid(over: Any) -> Grid:
     return Grid(tuple(axes), tuple(shape), values)
 
 
-def _columns(names: tuple[str, ...], given: Any) -> tuple[np.ndarray, ...]:
-    """Of points `(points, len(names))`, one column for each name."""
-    points = _numbers(", ".join(names), given)
+def _columns(names: tuple[str, ...], points: Any) -> tuple[np.ndarray, ...]:
+    """The columns of points of shape `(points, len(names))`, one for each name."""
+    points = _numbers(", ".join(names), points)
     if points.ndim != 2 or points.shape[1] != len(names) or len(points) == 0:
         raise ValueError(
             f"`over`: the points of ({', '.join(names)}) have shape {points.shape}; give "
@@ -87,28 +87,27 @@ def _columns(names: tuple[str, ...], given: Any) -> tuple[np.ndarray, ...]:
     return tuple(points.T)
 
 
-def _arrays(name: str, given: Any) -> Any:
-    """A pytree of arrays with the values in front; a list or a tuple is one array."""
-    if isinstance(given, list | tuple | range):
-        given = np.asarray(given)
-    tree = jax.tree.map(lambda x: _numbers(name, x), given)
+def _arrays(name: str, values: Any) -> Any:
+    """A pytree of arrays with the values along the first axis; a list is one array."""
+    if isinstance(values, list | tuple | range):
+        values = np.asarray(values)
+    tree = jax.tree.map(lambda x: _numbers(name, x), values)
     leaves = jax.tree.leaves(tree)
     counts = {len(x) if x.ndim > 0 else 0 for x in leaves}
     if len(counts) != 1 or counts == {0}:
         shapes = ", ".join(str(x.shape) for x in leaves) or "none"
         raise ValueError(
-            f"`over`: the values of `{name}` need one leading axis, in which there is at "
-            f"least one; the shapes of their arrays: {shapes}. A single value is a list "
-            "of one."
+            f"`over`: the values of `{name}` need one leading axis with at least one "
+            f"entry; the shapes of their arrays: {shapes}. A single value is a list of one."
         )
     return tree
 
 
-def _numbers(name: str, given: Any) -> np.ndarray:
-    array = np.asarray(given)
+def _numbers(name: str, values: Any) -> np.ndarray:
+    array = np.asarray(values)
     if not np.issubdtype(array.dtype, np.number) and array.dtype != bool:
         raise TypeError(
-            f"`over`: the values of `{name}` must be numbers, got {array.dtype}. Go "
-            "through schemes and other objects in a Python loop, with a sweep for each."
+            f"`over`: the values of `{name}` must be numbers, got {array.dtype}. For "
+            "schemes and other objects use a Python loop with one sweep for each."
         )
     return array.astype(jax.dtypes.canonicalize_dtype(array.dtype))

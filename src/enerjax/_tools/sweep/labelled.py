@@ -1,4 +1,4 @@
-"""Results that are found by the values of their parameters."""
+"""Results of a sweep, which can be selected by the values of the parameters."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -15,15 +15,14 @@ _Outcome = type(RESULTS.successful)
 
 @dataclasses.dataclass(frozen=True)
 class Sweep:
-    """What a sweep found.
+    """The results of a sweep.
 
     - `axes`: the names of the parameters along each of the leading axes of the results;
-      those that changed together share one.
-    - `parameters`: their values, along their axis; of a parameter that was chosen with
-      `at` its value.
-    - `values`: what the function returned, with the axes of the parameters in front.
+      parameters that change together share one axis.
+    - `parameters`: their values along their axis, or the one value that `at` has selected.
+    - `values`: the values of the function; the axes of the parameters come first.
 
-    `print` shows what there is, and how many lanes failed.
+    `print` shows the parameters, the results, and the number of failed lanes.
     """
 
     axes: tuple[tuple[str, ...], ...]
@@ -39,7 +38,7 @@ class Sweep:
 
     @property
     def failed(self) -> np.ndarray:
-        """Which lanes returned a failure (as `Solution.result`), an array of `shape`."""
+        """Which lanes returned a failure such as that in `Solution.result`; has `shape`."""
         failed = np.zeros(self.shape, bool)
         for _, leaf in self._named():
             if isinstance(leaf, _Outcome):
@@ -47,11 +46,11 @@ class Sweep:
         return failed
 
     def at(self, **chosen: Any) -> "Sweep":
-        """The part at some values of parameters, such as `swept.at(alpha=0.5, h=1e-3)`.
+        """The results for these values, such as `swept.at(alpha=0.5, h=1e-3)`.
 
-        Of parameters that changed together give as many as tell one point from the others.
+        If parameters change together, pass as many as are needed to identify one point.
 
-        **Raises:** `ValueError` for a value that is not there, and for several points.
+        **Raises:** `ValueError` for a value that was not swept, and for several points.
         """
         unknown = set(chosen) - {name for names in self.axes for name in names}
         if unknown:
@@ -67,11 +66,11 @@ class Sweep:
         return part
 
     def smallest(self, name: str) -> "Sweep":
-        """The one lane where a result, a number named as `print` does, is smallest.
+        """The lane with the smallest value of a result, which is named as in `print`.
 
-        Its `parameters` are those to start a search from. NaN is passed over.
+        Its `parameters` suit as the start of a search. Lanes with NaN are ignored.
 
-        **Raises:** `ValueError` if there is no such result, or only NaN.
+        **Raises:** `ValueError` if there is no such result, or if all lanes are NaN.
         """
         known = dict(self._named())
         if name not in known or np.shape(known[name]) != self.shape:
@@ -91,8 +90,8 @@ class Sweep:
     def to_xarray(self) -> Any:
         """An `xarray.Dataset`: results with named axes, the parameters as coordinates.
 
-        Outcomes become their messages. Axes of the results themselves are named after
-        them, `energy_0`, `energy_1`; parameters that are pytrees have no coordinate.
+        Outcomes become their messages. Further axes of a result are named after it,
+        `energy_0`, `energy_1`; parameters that are pytrees have no coordinate.
 
         **Raises:** `ImportError` without xarray (the extra `sweep`).
         """
@@ -134,7 +133,7 @@ class Sweep:
         return "\n".join(lines)
 
     def _named(self) -> Iterator[tuple[str, Any]]:
-        """The results and what they are called: outcomes, and arrays."""
+        """The names and values of the results, which are outcomes or arrays."""
         flat, _ = jax.tree_util.tree_flatten_with_path(
             self.values, is_leaf=lambda x: isinstance(x, _Outcome)
         )
@@ -142,25 +141,26 @@ class Sweep:
             yield jax.tree_util.keystr(path, simple=True, separator=".") or "value", leaf
 
     def _find(self, names: tuple[str, ...], given: dict[str, Any]) -> int:
-        """The number of the point at which parameters have some values."""
+        """The index of the point with these values of parameters."""
         match = np.array(True)
         for name, value in given.items():
             array = self.parameters[name]
             if not isinstance(array, np.ndarray) or array.ndim != 1:
                 raise ValueError(
-                    f"The values of `{name}` are no numbers to choose by: index "
-                    "`values` along its axis."
+                    f"The values of `{name}` are not scalars: index `values` along its "
+                    "axis instead."
                 )
-            # Decimal fractions are often rounded twice on their way here.
+            # A value may have been rounded differently from the one in the grid.
             here = np.isclose(array, value, rtol=1e-6, atol=0, equal_nan=True)
             if not here.any():
                 raise ValueError(f"`{name}` = {value} was not swept; its values: {array}.")
             match = match & here
         found = np.flatnonzero(match)
         if found.size != 1:
-            told = ", ".join(f"{name} = {value}" for name, value in given.items())
+            choice = ", ".join(f"{name} = {value}" for name, value in given.items())
             raise ValueError(
-                f"{told}: {found.size} points of ({', '.join(names)}) are there, not one."
+                f"{choice}: this selects {found.size} points of ({', '.join(names)}), not "
+                "one."
             )
         return int(found[0])
 

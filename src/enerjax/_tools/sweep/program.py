@@ -1,4 +1,4 @@
-"""The one program of a sweep: a chunk of lanes on all devices of this process."""
+"""The program of a sweep, which runs a chunk of lanes on all devices of this process."""
 
 import inspect
 from collections.abc import Callable
@@ -9,14 +9,14 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 
-# Measured (benchmarks/batch.py), for lanes that take their steps together: more at once
-# leave the cache of a core, and all wait for the slowest. (Those of small systems run one
-# after the other in any case.) Other processors take what fits.
-_TOGETHER_ON_CPU = 16
+# The fastest batch of lanes on CPUs according to benchmarks/batch.py: more lanes do not fit
+# into the cache of a core, and all wait for the slowest. (Lanes of small systems run one
+# after the other in any case.)
+_BATCH_ON_CPU = 16
 
 
 def make_lane(fn: Callable, parameters: dict[str, Any]) -> tuple[Any, Any]:
-    """`fn` as a function of a dictionary, compiled once, and its trace."""
+    """`fn` as a jitted function of a dictionary of parameters, and its trace."""
     try:
         inspect.signature(fn).bind(**parameters)
     except TypeError as error:
@@ -25,7 +25,7 @@ def make_lane(fn: Callable, parameters: dict[str, Any]) -> tuple[Any, Any]:
             f"{error}."
         ) from None
     except ValueError:
-        pass  # No signature is known, as of some functions in C.
+        pass  # `fn` has no signature, like some functions in C.
 
     def lane(parameters: dict[str, Any]) -> Any:
         values = fn(**parameters)
@@ -34,8 +34,8 @@ def make_lane(fn: Callable, parameters: dict[str, Any]) -> tuple[Any, Any]:
         for leaf in jax.tree.leaves(values):
             if not isinstance(leaf, jax.Array | np.ndarray | np.generic | float | int):
                 raise TypeError(
-                    f"`fn` must return a pytree of arrays, and {leaf!r} in it is none. "
-                    "Return the parts of a `Solution` that are wanted, as a dictionary."
+                    f"`fn` must return a pytree of arrays, and {leaf!r} is no array. "
+                    "Return the required arrays of a `Solution` as a dictionary."
                 )
         return values
 
@@ -47,32 +47,31 @@ def make_lane(fn: Callable, parameters: dict[str, Any]) -> tuple[Any, Any]:
 class Chunk:
     """Runs chunks of lanes, all with one program.
 
-    Each device takes an equal part, and goes through it by `together` lanes. (Under a plain
-    `jit` all devices would have to agree, in each iteration of Newton's method, whether the
-    last lane of all is done, or to run all the lanes one after the other.)
+    Each device runs an equal share of a chunk, in batches of `batch_size` lanes. (Under a
+    plain `jit` all devices would synchronise in each iteration of Newton's method.)
     """
 
-    def __init__(self, lane: Callable, lanes: int, together: int | None):
+    def __init__(self, lane: Callable, lanes: int, batch_size: int | None):
         devices = jax.local_devices()
         share = -(-lanes // len(devices))
-        if together is None:
-            together = _TOGETHER_ON_CPU if devices[0].platform == "cpu" else share
-        together = min(together, share)
+        if batch_size is None:
+            batch_size = _BATCH_ON_CPU if devices[0].platform == "cpu" else share
+        batch_size = min(batch_size, share)
         self.lanes = lanes
-        self.padded = len(devices) * together * -(-share // together)
-        part = lambda parameters: jax.lax.map(lane, parameters, batch_size=together)
+        self.padded = len(devices) * batch_size * -(-share // batch_size)
+        of_device = lambda parameters: jax.lax.map(lane, parameters, batch_size=batch_size)
         if len(devices) > 1:
             mesh, spec = Mesh(np.array(devices), ("lanes",)), PartitionSpec("lanes")
-            # Lanes know nothing of each other: there is nothing to check.
-            part = jax.shard_map(
-                part, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
+            # Lanes are independent, so there are no variations over devices to check.
+            of_device = jax.shard_map(
+                of_device, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
             )
-        self._program = jax.jit(part)
+        self._program = jax.jit(of_device)
 
     def __call__(self, parameters: dict[str, Any]) -> list[np.ndarray]:
         """The leaves of the results of `lanes` lanes."""
         extra = self.padded - self.lanes
-        fill = lambda x: np.concatenate([x, np.repeat(x[-1:], extra, axis=0)])
-        results = self._program(jax.tree.map(fill, parameters))
-        # Copied: on CPUs a view would keep the memory of the device.
+        pad = lambda x: np.concatenate([x, np.repeat(x[-1:], extra, axis=0)])
+        results = self._program(jax.tree.map(pad, parameters))
+        # These are copies: on CPUs a view would keep the memory of the device.
         return [np.array(x)[: self.lanes] for x in jax.tree.leaves(results)]

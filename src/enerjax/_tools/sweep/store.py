@@ -1,4 +1,4 @@
-"""Results on disk, chunk by chunk: a sweep that was killed goes on where it stopped."""
+"""Results on disk, chunk by chunk, from which an interrupted sweep can be resumed."""
 
 import io
 import json
@@ -10,18 +10,19 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from .checksums import checksum
+from .fingerprint import checksum
 
 
-# Seconds after which a draft that nobody writes to is what a killed process left.
+# A draft that has not been written to for so many seconds belongs to a killed process.
 _ABANDONED = 3600
 
 
 class Store:
-    """A folder of one sweep: `sweep.json` tells which, each chunk is a file `.npz`.
+    """A folder with the results of one sweep.
 
-    Files appear whole or not at all, so that a process can be killed at any time; each
-    chunk holds a checksum of its arrays, so that later damage is found.
+    `sweep.json` contains the fingerprint of the sweep, and each chunk is a file `.npz`. A
+    process can be killed at any time, because files are written completely or not at all.
+    Each chunk contains a checksum of its arrays, so that damage is detected.
     """
 
     def __init__(self, path: str | os.PathLike, fingerprint: dict[str, str]):
@@ -36,22 +37,22 @@ class Store:
             found = dict(json.loads(label.read_text()))
         except (ValueError, TypeError):
             raise ValueError(
-                f"`path`: {label}, which tells what sweep the folder holds, is damaged. "
-                "Give a new folder, or delete that file if the chunks beside it are "
-                "certainly of the sweep that is called now."
+                f"`path`: {label}, the fingerprint of the sweep in this folder, is "
+                "damaged. Choose a new folder, or delete that file if the chunks beside it "
+                "certainly belong to this sweep."
             ) from None
         other = [key for key, word in fingerprint.items() if found.get(key) != word]
         if other:
             raise ValueError(
                 f"`path`: {self.path} holds another sweep (different: {', '.join(other)}). "
-                "To go on with that one call `sweep` as it was called, with the versions "
-                "of the libraries that it was made with; for a new one give a new folder."
+                "To resume that one call `sweep` with the same arguments and the same "
+                "versions of the libraries; for a new one choose a new folder."
             )
 
     def read(self, chunk: int) -> list[np.ndarray] | None:
-        """The arrays of a chunk, or `None` where it is not done.
+        """The arrays of a chunk, or `None` if it is not finished.
 
-        **Raises:** `ValueError` where the file is damaged.
+        **Raises:** `ValueError` if the file is damaged.
         """
         file = self._file(chunk)
         if not file.exists():
@@ -61,14 +62,14 @@ class Store:
             with np.load(io.BytesIO(data)) as content:
                 arrays = [content[f"arr_{k}"] for k in range(len(content.files) - 1)]
                 is_whole = str(content["sha256"]) == checksum(arrays)
-        # (A damaged archive raises errors of a dozen types.)
+        # A damaged archive raises errors of a dozen types.
         except Exception:
             is_whole, arrays = False, []
         if not is_whole:
             raise ValueError(
                 f"`path`: {file} is damaged: its content is not what was written. Delete "
-                "the file and call `sweep` again, which makes this chunk anew and keeps "
-                "the others; if it happens again, look at the disk."
+                "the file and call `sweep` again, which repeats this chunk and keeps the "
+                "others; if it happens again, check the disk."
             )
         return arrays
 
@@ -80,8 +81,8 @@ class Store:
         return self.path / f"chunk-{chunk:06d}.npz"
 
     def _put(self, target: Path, write: Callable[[BinaryIO], Any]) -> None:
-        # Beside its place, under a name of this process: `replace` is atomic only within
-        # one file system, and others may write the same label.
+        # The draft is in the same folder, because `replace` is atomic only within one file
+        # system. Its name contains the process, because others may write the same file.
         draft = target.with_name(f".{target.name}.{os.getpid()}")
         try:
             with draft.open("wb") as file:
@@ -93,11 +94,11 @@ class Store:
             draft.unlink(missing_ok=True)
 
     def _clear(self) -> None:
-        """Remove what processes left that were killed while they wrote."""
+        """Removes the drafts of processes that were killed while they wrote."""
         for pattern in (".chunk-*.npz.*", ".sweep.json.*"):
             for draft in self.path.glob(pattern):
                 try:
                     if time.time() - draft.stat().st_mtime > _ABANDONED:
                         draft.unlink()
                 except FileNotFoundError:
-                    pass  # Its process has finished it, or another has removed it.
+                    pass  # It has been finished, or removed by another process.

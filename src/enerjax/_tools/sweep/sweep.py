@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from ..._run import positive_integer
 from .fingerprint import fingerprint
@@ -12,6 +13,9 @@ from .grid import make_grid
 from .labelled import Sweep
 from .program import Chunk, make_lane
 from .store import Store
+
+
+Progress = TypeAliasType("Progress", bool | Callable[[int, int], None])
 
 
 def sweep(
@@ -22,9 +26,9 @@ def sweep(
     batch_size: int | None = None,
     sort_by: str | None = None,
     path: str | os.PathLike | None = None,
-    progress: bool | Callable[[int, int], None] = False,
+    progress: Progress = False,
 ) -> Sweep:
-    """The results of a function over a grid of parameters, all from one program.
+    """Evaluates a function over a grid of parameters, with one compiled program.
 
         def lost(alpha, h):
             scheme = ej.EnergyConsistent(alpha)
@@ -38,40 +42,38 @@ def sweep(
         swept.values["energy"]  # shape (3, 20)
         swept.at(alpha=0.5).values["energy"]  # shape (20,)
 
-    Lanes are vectorised in small batches, and go through one compiled program chunk by
-    chunk: memory on the device is that of a chunk. Each device of the process takes an
-    equal part of a chunk. Under `jax.distributed` the processes take chunks in turn, and
-    all return the whole result.
+    Each combination of parameters is a lane. Lanes are vectorised in small batches and run
+    chunk by chunk, so that the memory of the device must hold one chunk. All devices of the
+    process share the lanes of a chunk. Under `jax.distributed` the processes take chunks in
+    turn, and all return the whole result.
 
     **Arguments:**
 
-    - `fn`: takes the parameters by name and returns a pytree of arrays. It is traced: all
-      parameters are numbers, not part of the program. Make runs with `throw=False`, and
-      return their `result`: a lane that failed is then marked, and the others do not
-      notice. With `throw=True` it would end the sweep.
-    - `over`: the names of parameters and their values, a sequence for each; all
-      combinations are run. A tuple of names stands for parameters that change together,
-      `{("m", "l"): [[1.0, 0.5], [2.0, 0.7]]}`, a row for each point. The values of one name
-      can also be arrays of any shape or pytrees of them (starts, `args`), stacked along a
-      leading axis.
-    - `chunk`: how many lanes are computed, reported and written at a time; rounded down to
-      make them equal.
-    - `batch_size`: how many lanes take their steps together. They wait for the slowest of
-      them (on CPUs not those of small systems, which run one after the other). By default
-      16 on CPUs, and as many as there are elsewhere.
+    - `fn`: takes the parameters by name and returns a pytree of arrays. The parameters are
+      traced. Use `throw=False` in runs and return their `result`: failed lanes are then
+      marked and do not affect the others. With `throw=True` one would end the sweep.
+    - `over`: a dictionary of parameter names and sequences of values; all combinations are
+      run. A tuple of names stands for parameters that change together, with one row for
+      each point: `{("m", "l"): [[1.0, 0.5], [2.0, 0.7]]}`. The values of one name can also
+      be arrays of any shape, or pytrees of them (starts, `args`), stacked along a leading
+      axis.
+    - `chunk`: the largest number of lanes that are computed, reported and written at a
+      time; all chunks have the same length.
+    - `batch_size`: how many lanes are vectorised. They all wait for the slowest of them.
+      (Lanes of small systems run one after the other on CPUs.) By default 16 on CPUs, and
+      all lanes of a chunk elsewhere.
     - `sort_by`: the name of the parameter that the work of a lane depends on most, such as
-      `h` if all runs end at the same time: lanes that take their steps together are then
-      alike.
-    - `path`: a folder. Each chunk is written there as it is done, and a sweep that was
-      stopped goes on from there if it is called again, also with other devices or
+      `h` if all runs end at the same time. Lanes of a batch then take similar times.
+    - `path`: a folder to which each finished chunk is written. If the same sweep is called
+      again after an interruption it is resumed from there, even with other devices or
       processes.
-    - `progress`: `True` for a line on stderr, or a function of the number of lanes that
-      are done and that of all of this process.
+    - `progress`: `True` for a line on stderr, or a function of the numbers of finished
+      lanes and of all lanes of this process.
 
     **Returns:** a `Sweep`.
 
     **Raises:** `ValueError` or `TypeError` for bad input, for a `fn` that returns anything
-    else than arrays, and where `path` holds another sweep or a file that is damaged.
+    but arrays, and if `path` holds another sweep or a damaged file.
     """
     grid = make_grid(over)
     chunk = positive_integer("chunk", chunk)
@@ -83,7 +85,7 @@ def sweep(
     count = -(-grid.size // chunk)
     chunks = _equal(order, count)
     store = None if path is None else Store(path, fingerprint(grid, chunks, traced))
-    # Those of this process; the others are made elsewhere.
+    # The chunks of this process.
     own = range(jax.process_index(), count, jax.process_count())
     lanes = [min(chunks.shape[1], order.size - k * chunks.shape[1]) for k in own]
     report = _reporter(progress, sum(lanes))
@@ -99,43 +101,41 @@ def sweep(
     if jax.process_count() > 1:
         done = _exchange(done, count, traced.out_info, chunks.shape[1])
     columns = zip(*(done[number] for number in range(count)), strict=True)
-    leaves = [_in_place(np.concatenate(column), order, grid.shape) for column in columns]
+    leaves = [_unsorted(np.concatenate(column), order, grid.shape) for column in columns]
     values = jax.tree.unflatten(jax.tree.structure(traced.out_info), leaves)
     return Sweep(grid.axes, grid.values, values)
 
 
 def _equal(order: np.ndarray, count: int) -> np.ndarray:
-    """Lanes in chunks of one length, shape `(count, lanes)`; the last lane fills up."""
+    """Lanes in chunks of equal length, `(count, lanes)`; the last lane is repeated."""
     length = -(-order.size // count)
     return np.pad(order, (0, count * length - order.size), "edge").reshape(count, length)
 
 
-def _in_place(column: np.ndarray, order: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """From the order in which lanes were run to that of the grid."""
-    placed = np.empty_like(column, shape=(order.size, *column.shape[1:]))
-    placed[order] = column[: order.size]
-    return placed.reshape(*shape, *column.shape[1:])
+def _unsorted(column: np.ndarray, order: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Results in the order of the grid, from those in the order of the runs."""
+    result = np.empty_like(column, shape=(order.size, *column.shape[1:]))
+    result[order] = column[: order.size]
+    return result.reshape(*shape, *column.shape[1:])
 
 
 def _exchange(
     done: dict[int, list[np.ndarray]], count: int, like: Any, length: int
 ) -> dict[int, list[np.ndarray]]:
-    """All chunks in all processes, a round of chunks at a time."""
+    """The chunks of all processes; one chunk of each process is exchanged at a time."""
     from jax.experimental import multihost_utils
 
-    everywhere, processes = {}, jax.process_count()
+    gathered_chunks, processes = {}, jax.process_count()
     blank = [np.zeros((length, *x.shape), x.dtype) for x in jax.tree.leaves(like)]
     for begin in range(0, count, processes):
         mine = done.get(begin + jax.process_index(), blank)
         gathered = multihost_utils.process_allgather(mine)
         for k in range(min(processes, count - begin)):
-            everywhere[begin + k] = [np.asarray(x)[k] for x in gathered]
-    return everywhere
+            gathered_chunks[begin + k] = [np.asarray(x)[k] for x in gathered]
+    return gathered_chunks
 
 
-def _reporter(
-    progress: bool | Callable[[int, int], None], total: int
-) -> Callable[[int], None]:
+def _reporter(progress: Progress, total: int) -> Callable[[int], None]:
     if callable(progress):
         return lambda done: progress(done, total)
     if not progress:
