@@ -93,7 +93,7 @@ BAD = {
     ),
     "stranger": (lambda: [ROD, "pin"], "made of bodies, joints, forces and drives"),
     "no list": (lambda: ROD, "a list of parts.*\\[rod\\]"),
-    "ground": (lambda: [Point("ground", 1.0, [0.0, 0.0])], "'ground' is that of what"),
+    "ground": (lambda: [Point("ground", 1.0, [0.0, 0.0])], "'ground' is reserved"),
     "no name": (
         lambda: [ROD, Revolute("pin", "ground", ROD)],  # type: ignore
         "'pin' connects bodies by their names.*write 'rod'",

@@ -116,7 +116,11 @@ def test_starts_from_many_guesses():
         (GUESS | {"offset": np.nan}, {}, "`offset` is nan; it must be finite"),
         ({}, {}, "holds no parameters"),
         (GUESS, {"positive": {"b": True}}, "does not fit to the parameters a, offset"),
-        (GUESS, {"solver": optx.Newton(1e-8, 1e-8)}, "`solver` must be one of optimistix"),
+        (
+            GUESS,
+            {"solver": optx.Newton(1e-8, 1e-8)},
+            "`solver` must be a least-squares solver",
+        ),
         (GUESS | {"rate": -1e9}, {}, "not finite where the fit began"),
         (GUESS | {"offset": np.zeros(40)}, {}, "40 numbers for 42 parameters"),
         (GUESS, {"max_steps": 0}, "positive integer"),

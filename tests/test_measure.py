@@ -108,7 +108,7 @@ def test_refusals_are_rows():
 @pytest.mark.parametrize(
     ("schemes", "steps", "reference", "message"),
     [
-        (SCHEMES, [10], (0.123, [1.0, 0.0]), "does not pass t = 0.123"),
+        (SCHEMES, [10], (0.123, [1.0, 0.0]), "ends at t = 0.123"),
         (SCHEMES, [10], (1.0, [1.0, 0.0, 0.0]), "has shape"),
         (SCHEMES, [10], (1.0,), "must be a scheme, or data"),
         (SCHEMES, [], None, "`steps` is empty"),

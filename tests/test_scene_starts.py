@@ -61,7 +61,7 @@ def pendulum(velocity, spin):
 
 
 def test_velocities_that_no_joint_allows_are_refused():
-    with pytest.raises(ValueError, match="do not fit 'pin'.*part at 2"):
+    with pytest.raises(ValueError, match="do not fit 'pin'.*grow at 2"):
         pendulum([0.0, 3.0], 2.0).start()
     # Rounded to two digits, they are repaired, by the least kinetic energy.
     rounded = pendulum([0.0, 1.01], 2.0).start().v

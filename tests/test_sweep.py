@@ -86,7 +86,7 @@ def test_parameters_that_change_together():
     np.testing.assert_array_equal(found.values["sum"], [6, 7, 9])
     assert found.at(a=2.0, b=7.0).values["sum"] == 9
     assert found.at(a=1.0).parameters == dict(a=1.0, b=5.0)
-    with pytest.raises(ValueError, match=r"a = 2.0: 2 points of \(a, b\)"):
+    with pytest.raises(ValueError, match=r"a = 2.0: this selects 2 points of \(a, b\)"):
         found.at(a=2.0)
 
 

@@ -1,12 +1,11 @@
 """The paper's test cases and benchmark mechanisms, as `(system, start, args)`.
 
-Each function builds a `Problem`; calls with other numbers share one compiled program.
-Units are SI. In the plane gravity acts along +y, in the mechanisms along -y;
-in space along -z.
+Each function builds a `Problem`; calls with other numbers share one compiled program. Units
+are SI unless stated. In the plane gravity acts along +y, for mechanisms along -y, and in
+space along -z.
 """
 
 from ._base import Problem as Problem
-from ._driven import car_axis as car_axis
 from ._mechanisms import (
     four_bar as four_bar,
     parallel_bars as parallel_bars,
@@ -14,6 +13,8 @@ from ._mechanisms import (
     slider_crank as slider_crank,
     spatial_four_bar as spatial_four_bar,
     squeezer as squeezer,
+    steady_top as steady_top,
+    tethered_body as tethered_body,
 )
 from ._particles import (
     fput as fput,
@@ -35,8 +36,8 @@ from ._rigid_bodies import (
     heavy_top_canonical as heavy_top_canonical,
     heavy_top_directors as heavy_top_directors,
 )
-from ._spatial import steady_top as steady_top, tethered_body as tethered_body
 from ._springs import (
+    car_axis as car_axis,
     elastic_pendulum as elastic_pendulum,
     four_particles as four_particles,
     spring_pendulum as spring_pendulum,

@@ -1,16 +1,15 @@
 from typing import NamedTuple
 
+import jax.numpy as jnp
+
 from .._analysis import initial_state
 from .._system import AbstractSystem, State
-from .._types import Args, Vector
+from .._types import Args, Scalar, Vector, Velocities
 from ..scenes import Scene
 
 
 class Problem(NamedTuple):
-    """A system, a consistent start and its arguments.
-
-    Use as `system, start, args = pendulum()`.
-    """
+    """A system, a consistent start and `args`: `system, start, args = pendulum()`."""
 
     system: AbstractSystem
     start: State
@@ -21,5 +20,15 @@ def problem(system: AbstractSystem, q: Vector, v: Vector, args: Args) -> Problem
     return Problem(system, initial_state(system, q, v, args), args)
 
 
-def made(scene: Scene) -> Problem:
+def problem_of(scene: Scene) -> Problem:
     return Problem(*scene.build())
+
+
+def equal_masses_kinetic(v: Velocities, args: Args) -> Scalar:
+    """The kinetic energy of points with the same mass `m`."""
+    return 0.5 * args["m"] * v @ v
+
+
+def planar_points_kinetic(v: Velocities, args: Args) -> Scalar:
+    """The kinetic energy of points in the plane with the masses `m`."""
+    return 0.5 * args["m"] @ jnp.sum(v.reshape(-1, 2) ** 2, axis=1)

@@ -1,4 +1,4 @@
-"""Mechanisms made of parts; gravity acts along -y here, as in their sources."""
+"""Mechanisms that are made as scenes; gravity acts along -y in the plane, -z in space."""
 
 from collections.abc import Sequence
 
@@ -7,7 +7,7 @@ import numpy as np
 
 from .._types import Real
 from ..scenes import bodies, forces, joints, Scene
-from ._base import made, Problem
+from ._base import Problem, problem_of
 
 
 _EARTH = (0.0, -9.81)
@@ -20,7 +20,7 @@ def point_pendulum(g: Real = 9.81) -> Problem:
     """
     point = bodies.PointMass("point", 1.0, [-1.0, 0.0])
     rod = joints.Distance("rod", "ground", "point")
-    return made(Scene([point, rod], gravity=jnp.array([0.0, -1.0]) * g))
+    return problem_of(Scene([point, rod], gravity=jnp.array([0.0, -1.0]) * g))
 
 
 def slider_crank(
@@ -42,7 +42,7 @@ def slider_crank(
         joints.Revolute("small end", "slider", "rod", [0.0, 0.0]),
         joints.Prismatic("guide", "ground", "slider", axis=[1.0, 0.0]),
     ]
-    return made(Scene(parts, gravity=_EARTH))
+    return problem_of(Scene(parts, gravity=_EARTH))
 
 
 def four_bar(
@@ -64,14 +64,14 @@ def four_bar(
         joints.Revolute("C", "coupler", "rocker", [coupler / 2, 0.0]),
         joints.Revolute("D", "ground", "rocker", base),
     ]
-    return made(Scene(parts, gravity=_EARTH))
+    return problem_of(Scene(parts, gravity=_EARTH))
 
 
 def parallel_bars(num_cells: int = 2, speed: Real = 1.0) -> Problem:
     """Upright rods on the ground, joined at their tops by level rods: N four-bars in a row.
 
-    Rods of 1 m and 1 kg. Where all of them lie level the mechanism is singular: it could
-    fold there. Coordinates `(x, y, angle)` of the uprights and level rods in turn.
+    Rods of 1 m and 1 kg. The mechanism is singular when all rods are horizontal, because it
+    could fold there. Coordinates `(x, y, angle)` of the uprights and level rods in turn.
 
     **Source:** IFToMM multibody benchmark A02 (N = 2; N = 40).
     """
@@ -92,11 +92,11 @@ def parallel_bars(num_cells: int = 2, speed: Real = 1.0) -> Problem:
                 rod(level, 1.0, [k, 1], [k + 1, 1], moving),
                 joints.Revolute(f"left {k + 1}", upright, level, top, foot),
             ]
-    return made(Scene(parts, gravity=_EARTH))
+    return problem_of(Scene(parts, gravity=_EARTH))
 
 
-# Andrews' mechanism, in the names of the source. Of each body: mass, inertia, angle, the
-# point it hangs from, and its mass centre in axes of the body from there.
+# Andrews' mechanism, with the names of the source. For each body: mass, inertia, angle, a
+# point, and the mass centre relative to this point in the axes of the body.
 _BETA, _THETA, _GAMMA = -0.06171389001427645, 0.0, 0.45527981916307037
 _PHI, _DELTA = 0.22266839016588588, 0.48736497954384256
 _OMEGA, _EPSILON = -0.22266839016588588, 1.2305474445498212
@@ -149,7 +149,7 @@ def squeezer(torque: Real = 0.033) -> Problem:
         forces.Spring("spring", "ground", "K3", 4530.0, 0.07785, [0.014, 0.072], hook),
         forces.ConstantTorque("motor", "K1", torque),
     ]
-    return made(Scene(parts))
+    return problem_of(Scene(parts))
 
 
 def _turned(angle: float, x: Sequence[float] | np.ndarray) -> np.ndarray:
@@ -158,11 +158,11 @@ def _turned(angle: float, x: Sequence[float] | np.ndarray) -> np.ndarray:
 
 
 def spatial_four_bar(speed: Real = 20.0) -> Problem:
-    """A spatial four-bar: crank and rocker on pins that cross, a coupler on ball joints.
+    """A spatial four-bar: crank and rocker turn about skew pins, a coupler joins them.
 
-    The crank, a flywheel, turns about x, the rocker about y; gravity acts along -z. Two
-    degrees of freedom: the coupler spins about itself. In directors, twelve coordinates a
-    body: mass centre and body axes.
+    The crank, a flywheel, turns about x, the rocker about y; gravity acts along -z. There
+    are two degrees of freedom, because the coupler can spin about its axis between its ball
+    joints. Each body has twelve coordinates, the mass centre and the body axes.
     """
     pin, knee, base = np.array([0.0, 0.0, 0.15]), np.array([0.4, 0.5, 0.5]), (0.4, 0.5, 0.0)
     axis_a, axis_d = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
@@ -178,4 +178,49 @@ def spatial_four_bar(speed: Real = 20.0) -> Problem:
         joints.Spherical("C", "rocker", "coupler", [0.0, 0.0, 0.25]),
         joints.Revolute("D", "ground", "rocker", base, axis=axis_d),
     ]
-    return made(Scene(parts, gravity=(0.0, 0.0, -9.81)))
+    return problem_of(Scene(parts, gravity=(0.0, 0.0, -9.81)))
+
+
+def steady_top(precession: Real = 10.0) -> Problem:
+    """A cone that precesses steadily about its tip at 60 degrees from the vertical.
+
+    With the spin about its axis that belongs to the `precession` its rotation is
+    `Rz(precession t) Rx(pi/3) Rz(spin t)`, so its height is constant. The coordinates are
+    the mass centre, which is 0.075 from the tip, and the body axes.
+
+    **Source:** P. L. Kinon and P. Betsch, Multibody Syst. Dyn. (2024).
+    """
+    density, height, radius, gravity, tilt = 2700.0, 0.1, 0.05, 9.81, np.pi / 3
+    mass, centre = density * np.pi * radius**2 * height / 3, 0.75 * height
+    axial = 0.3 * mass * radius**2
+    across = mass * (0.15 * radius**2 + 0.0375 * height**2)
+    # Steady precession: the moment of the weight turns the angular momentum.
+    swing = (across + mass * centre**2 - axial) * np.cos(tilt)
+    spin = (mass * gravity * centre / precession + swing * precession) / axial
+    axis = np.array([0.0, -np.sin(tilt), np.cos(tilt)])
+    turning = spin * axis + jnp.array([0.0, 0.0, 1.0]) * precession
+    c, s = axis[2], -axis[1]
+    top = bodies.RigidBody(
+        "top",
+        mass,
+        [across, across, axial],
+        centre * axis,
+        np.array([[1, 0, 0], [0, c, -s], [0, s, c]]),
+        velocity=jnp.cross(turning, centre * axis),
+        angular_velocity=turning,
+    )
+    tip = joints.Spherical("tip", "ground", "top", [0.0, 0.0, 0.0])
+    return problem_of(Scene([top, tip], gravity=[0.0, 0.0, -gravity]))
+
+
+def tethered_body() -> Problem:
+    """A rod of 1 kg that falls from the horizontal, tied to the ground by its end.
+
+    The tether, of length 2, is horizontal too at first, and perpendicular to the rod. It is
+    a `Distance`, which can push as well as pull.
+
+    **Source:** Project Chrono, unit tests of joints against ADAMS, `Distance_Case02`.
+    """
+    body = bodies.RigidBody("body", 1.0, [0.04, 0.1, 0.1], [-1.0, 4.0, 3.0])
+    tether = joints.Distance("tether", "ground", "body", [1.0, 2, 3], [2.0, 0, 0])
+    return problem_of(Scene([body, tether], gravity=[0.0, 0.0, -9.80665]))

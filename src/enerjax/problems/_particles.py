@@ -1,11 +1,11 @@
-"""Points without constraints: the classics of numerical integration, in their own units."""
+"""Unconstrained points: classical problems of numerical integration, in their own units."""
 
 import jax.numpy as jnp
 import numpy as np
 
 from .._system import System
 from .._types import Args, Coordinates, Real, Scalar, Velocities
-from ._base import Problem, problem
+from ._base import planar_points_kinetic, Problem, problem
 
 
 def _unit_kinetic(v: Velocities, args: Args) -> Scalar:
@@ -76,10 +76,6 @@ def fput(omega: Real = 50.0) -> Problem:
 _FIRST, _SECOND = np.triu_indices(7, 1)
 
 
-def _stars_kinetic(v: Velocities, args: Args) -> Scalar:
-    return 0.5 * args["m"] @ jnp.sum(v.reshape(-1, 2) ** 2, axis=1)
-
-
 def _stars_potential(q: Coordinates, args: Args) -> Scalar:
     x, m = q.reshape(-1, 2), args["m"]
     distance = jnp.sqrt(jnp.sum((x[_FIRST] - x[_SECOND]) ** 2, axis=1))
@@ -100,4 +96,4 @@ def pleiades() -> Problem:
     vy = [0.0, 0, 0, -1.25, 1, 0, 0]
     q, v = (np.stack(pair, axis=1).ravel() for pair in ((x, y), (vx, vy)))
     args = dict(m=jnp.arange(1.0, 8.0))
-    return problem(System(_stars_kinetic, _stars_potential), q, v, args)
+    return problem(System(planar_points_kinetic, _stars_potential), q, v, args)

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 
 from .._system import System
 from .._types import Args, Coordinates, Multipliers, Real, Scalar, Velocities
-from ._base import Problem, problem
+from ._base import equal_masses_kinetic, planar_points_kinetic, Problem, problem
 
 
 def _angle_kinetic(v: Velocities, args: Args) -> Scalar:
@@ -24,10 +24,6 @@ def pendulum_angle(m: Real = 1.0, l: Real = 1.0, g: Real = 9.81) -> Problem:
     return problem(System(_angle_kinetic, _angle_potential), [jnp.pi / 2], [0.0], args)
 
 
-def _point_kinetic(v: Velocities, args: Args) -> Scalar:
-    return 0.5 * args["m"] * v @ v
-
-
 def _point_potential(q: Coordinates, args: Args) -> Scalar:
     return -args["m"] * args["g"] * q[1]
 
@@ -43,7 +39,7 @@ def pendulum(m: Real = 1.0, l: Real = 1.0, g: Real = 9.81) -> Problem:
     """
     args = dict(m=m, l=l, g=g)
     return problem(
-        System(_point_kinetic, _point_potential, _rod), [l, 0.0], [0.0, 0.0], args
+        System(equal_masses_kinetic, _point_potential, _rod), [l, 0.0], [0.0, 0.0], args
     )
 
 
@@ -106,10 +102,6 @@ def stiff_double_pendulum() -> Problem:
     return double_pendulum(m1=0.005)
 
 
-def _chain_kinetic(v: Velocities, args: Args) -> Scalar:
-    return 0.5 * args["m"] @ jnp.sum(v.reshape(-1, 2) ** 2, axis=1)
-
-
 def _chain_potential(q: Coordinates, args: Args) -> Scalar:
     return -args["g"] * args["m"] @ q[1::2]
 
@@ -121,13 +113,14 @@ def _chain_rods(q: Coordinates, args: Args) -> Multipliers:
 
 
 def chain(num_links: int, length: Real = 1.0, mass: Real = 1.0, g: Real = 9.81) -> Problem:
-    """A chain of equal rods and points, straight and horizontal, held at one end.
+    """A chain of equal rods and points, straight and horizontal, fixed at one end.
 
-    The fall ends in a whip: the free end reaches speeds far beyond free fall.
+    At the end of the fall the chain cracks like a whip: its free end becomes far faster
+    than in free fall.
     """
     each = jnp.full((num_links,), 1 / num_links)
     args = dict(m=mass * each, l=length * each, g=g)
     x = length * jnp.arange(1, num_links + 1, dtype=float) / num_links
     q = jnp.stack([x, jnp.zeros_like(x)], axis=1).reshape(-1)
-    system = System(_chain_kinetic, _chain_potential, _chain_rods)
+    system = System(planar_points_kinetic, _chain_potential, _chain_rods)
     return problem(system, q, jnp.zeros_like(q), args)

@@ -1,4 +1,4 @@
-"""Rigid bodies: in Euler parameters (scalar first, body axes into space), directors."""
+"""Rigid bodies in Euler parameters (scalar first; from body axes to space) or directors."""
 
 from typing import Any
 
@@ -7,22 +7,8 @@ from jaxtyping import Array, Float
 
 from .._system import System
 from .._types import Args, Coordinates, Multipliers, Scalar, Velocities
+from ..scenes import quaternion_rates, rotation
 from ._base import Problem, problem
-
-
-def _rotation(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
-    """The rotation matrix, quadratic in `p` (orthogonal where `|p| = 1`)."""
-    scalar, vector = p[0], p[1:]
-    x, y, z = vector
-    cross = jnp.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    isotropic = (scalar**2 - vector @ vector) * jnp.eye(3, dtype=p.dtype)
-    return isotropic + 2 * (jnp.outer(vector, vector) + scalar * cross)
-
-
-def _body_rates(p: Float[Array, "4"]) -> Float[Array, "3 4"]:
-    """`2 E(p)` in `Omega = 2 E(p) pdot`, the angular velocity in body axes."""
-    e0, e1, e2, e3 = p
-    return 2 * jnp.array([[-e1, e0, e3, -e2], [-e2, -e3, e0, e1], [-e3, e2, -e1, e0]])
 
 
 def _unit(q: Coordinates, args: Args) -> Multipliers:
@@ -38,7 +24,7 @@ def _no_potential(q: Coordinates, args: Args) -> Scalar:
 
 
 def _spin_rates(q: Coordinates, args: Args) -> Float[Array, "3 4"]:
-    return _body_rates(q)
+    return quaternion_rates(q)
 
 
 def free_rigid_body() -> Problem:
@@ -65,13 +51,13 @@ def _top_potential(q: Coordinates, args: Args) -> Scalar:
 
 
 def _top_joint(q: Coordinates, args: Args) -> Multipliers:
-    return q[:3] - _rotation(q[3:]) @ args["centre"]
+    return q[:3] - rotation(q[3:]) @ args["centre"]
 
 
 def _top_rates(q: Coordinates, args: Args) -> Float[Array, "6 7"]:
     eye = jnp.eye(3, dtype=q.dtype)
     off = jnp.zeros((3, 4), q.dtype)
-    return jnp.block([[eye, off], [off[:, :3], _body_rates(q[3:])]])
+    return jnp.block([[eye, off], [off[:, :3], quaternion_rates(q[3:])]])
 
 
 _TOP_SPIN = (0.0, 150.0, -4.61538)
@@ -143,9 +129,9 @@ def heavy_top_directors() -> Problem:
 
 
 def _quaternion_hamiltonian(q: Coordinates, p: Coordinates, args: Args) -> Scalar:
-    momentum = 0.25 * _body_rates(q) @ p
+    momentum = 0.25 * quaternion_rates(q) @ p
     spin = jnp.linalg.solve(_about_joint(args), momentum)
-    height = _rotation(q)[2] @ args["centre"]
+    height = rotation(q)[2] @ args["centre"]
     stretching = 0.5 * (q @ p) ** 2  # of the redundant momentum; vanishes in the motion
     return 0.5 * momentum @ spin + stretching + args["m"] * args["g"] * height
 
@@ -162,5 +148,5 @@ def heavy_top_canonical() -> Problem:
     args = _top_args()
     system = System.from_hamiltonian(_quaternion_hamiltonian, _canonical_unit)
     q = jnp.array([1.0, 0, 0, 0])
-    p = _body_rates(q).T @ _about_joint(args) @ jnp.array(_TOP_SPIN)
+    p = quaternion_rates(q).T @ _about_joint(args) @ jnp.array(_TOP_SPIN)
     return problem(system, q, p, args)

@@ -1,6 +1,7 @@
 """Bodies, joints, forces and drives that compile to the functions of a `System`."""
 
 from . import bodies as bodies, drives as drives, forces as forces, joints as joints
+from ._body_coordinates import quaternion_rates as quaternion_rates, rotation as rotation
 from ._gaps import Gap as Gap
 from ._parameters import Parameters as Parameters
 from ._readouts import Readout as Readout

@@ -1,4 +1,4 @@
-"""What users write for a number, checked: NumPy where it is known, JAX where traced."""
+"""Checks of users' numbers: NumPy arrays for known values, JAX arrays for traced ones."""
 
 from types import ModuleType
 from typing import Any
@@ -10,7 +10,7 @@ from .._programs import is_known
 
 
 def module_of(*values: Any) -> ModuleType:
-    """`numpy` for known values: nothing is compiled to make a part; else `jax.numpy`."""
+    """`numpy` for known values, so that nothing is compiled; else `jax.numpy`."""
     return np if is_known(values) else jnp
 
 
@@ -21,7 +21,7 @@ def number(
     *shapes: tuple[int, ...],
     least: float | None = None,
 ) -> Any:
-    """`value` as an array of floats of one of the shapes, none below `least`."""
+    """`value` as a finite array with one of the shapes, and no entry below `least`."""
     known = is_known(value)
     try:
         array = np.asarray(value, float) if known else jnp.asarray(value)
@@ -50,17 +50,19 @@ def joined(*parts: Any) -> Any:
 
 
 def velocities(
-    part: str, *told: tuple[Any, tuple[int, ...]]
+    part: str, *values: tuple[Any, tuple[int, ...]]
 ) -> tuple[Any, tuple[bool, ...]]:
-    """All entries of a velocity and an angular velocity, told with their shapes, zeros
-    where they are `None`; and which are given."""
-    entries, given = [], []
-    roles = ("`velocity`", "`angular_velocity`")[: len(told)]
-    for role, (value, shape) in zip(roles, told, strict=True):
-        some = np.zeros(shape) if value is None else value
-        entries.append(number(part, role, some, shape))
-        given += [value is not None] * entries[-1].size
-    return joined(*entries), tuple(given)
+    """The entries of a velocity and an angular velocity, and which of them are prescribed.
+
+    Each is passed with its shape. One that is `None` is zero and not prescribed.
+    """
+    entries, prescribed = [], []
+    roles = ("`velocity`", "`angular_velocity`")[: len(values)]
+    for role, (value, shape) in zip(roles, values, strict=True):
+        array = np.zeros(shape) if value is None else value
+        entries.append(number(part, role, array, shape))
+        prescribed += [value is not None] * entries[-1].size
+    return joined(*entries), tuple(prescribed)
 
 
 def direction(part: str, role: str, value: Any, dimension: int) -> Any:
@@ -74,8 +76,8 @@ def direction(part: str, role: str, value: Any, dimension: int) -> Any:
 
 
 def basis(axis: Any) -> Any:
-    """Unit vectors along the rows, right-handed: along the axis the last one in space,
-    the first one in the plane."""
+    """A right-handed basis with unit vectors as rows. The axis is the last of them in
+    space, and the first in the plane."""
     xp = module_of(axis)
     if axis.shape == (2,):
         return xp.stack([axis, axis[::-1] * np.array([-1.0, 1.0])])

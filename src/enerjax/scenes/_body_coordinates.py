@@ -1,7 +1,7 @@
-"""The coordinates of bodies: what all bodies of one kind have in common.
+"""The coordinates of each kind of body.
 
-Each is a set of plain functions of the coordinates `q` and velocities `v` of one body.
-Kinds are compared by value, so scenes that are made alike share their programs.
+A kind is a set of plain functions of the coordinates `q` and velocities `v` of one body.
+Kinds are compared by value, so that scenes with the same structure share their programs.
 """
 
 import abc
@@ -17,13 +17,13 @@ from ._frames import Numbers, Point
 
 
 class AbstractBodyCoordinates(abc.ABC):
-    """How a body of some kind moves.
+    """The coordinates of one kind of body.
 
     - `dimension`: 2 in the plane, 3 in space.
     - `turns`: whether the body has an orientation.
     - `num_coordinates`, `num_velocities`: of one body.
-    - `num_internal`: constraints between the coordinates of one body, for which the rate
-      must be held too; those that hold by definition are `num_redundant`.
+    - `num_internal`: constraints between its coordinates whose rate must vanish too.
+    - `num_redundant`: relations between its coordinates whose rate vanishes for every `v`.
     """
 
     dimension: int
@@ -44,7 +44,7 @@ class AbstractBodyCoordinates(abc.ABC):
         return q[: self.dimension]
 
     def axes(self, q: Coordinates) -> Float[Array, "d d"]:
-        """The body axes in space, as rows."""
+        """The body axes in space, as rows of a matrix."""
         return jnp.eye(self.dimension, dtype=q.dtype)
 
     def angle(self, q: Coordinates) -> Scalar:
@@ -56,11 +56,11 @@ class AbstractBodyCoordinates(abc.ABC):
         """The kinetic energy, quadratic in `v`."""
 
     def internal(self, q: Coordinates) -> Multipliers:
-        """Constraints between the coordinates."""
+        """The internal constraints, `num_internal` rows."""
         return jnp.zeros((0,), q.dtype)
 
     def redundant(self, q: Coordinates) -> Multipliers:
-        """Relations of redundant coordinates."""
+        """The relations between redundant coordinates, `num_redundant` rows."""
         return jnp.zeros((0,), q.dtype)
 
     def velocity_map(self, q: Coordinates) -> Float[Array, "nv nq"]:
@@ -113,7 +113,7 @@ class PlanarBodies(AbstractBodyCoordinates):
         return translation(v[:2], numbers) + 0.5 * numbers["inertia"] * v[2] ** 2
 
 
-# The six products of three axes.
+# The six pairs of three axes.
 _LEFT, _RIGHT = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
 
 
@@ -134,7 +134,7 @@ class DirectorBodies(AbstractBodyCoordinates):
 
     def kinetic(self, v, numbers):
         inertia, rates = numbers["inertia"], v[3:].reshape(3, 3)
-        # The second moments of the mass: those of inertia are sums of two of them.
+        # Second moments of the mass; moments of inertia are sums of two of them.
         moments = 0.5 * jnp.trace(inertia) * jnp.eye(3, dtype=v.dtype) - inertia
         turning = 0.5 * jnp.sum(moments * (rates @ rates.T))
         return translation(v[:3], numbers) + turning
@@ -153,6 +153,13 @@ def rotation(p: Float[Array, "4"]) -> Float[Array, "3 3"]:
     cross = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
     isotropic = (scalar**2 - vector @ vector) * jnp.eye(3, dtype=p.dtype)
     return isotropic + 2 * (jnp.outer(vector, vector) + scalar * cross)
+
+
+def quaternion_rates(p: Float[Array, "4"]) -> Float[Array, "3 4"]:
+    """`2 E(p)` in `Omega = 2 E(p) pdot`, with the angular velocity in body axes."""
+    a, b, c, d = p
+    rows = [[-b, a, d, -c], [-c, -d, a, b], [-d, c, -b, a]]
+    return 2 * jnp.stack([jnp.stack(row) for row in rows])
 
 
 @dataclass(frozen=True)
@@ -178,16 +185,10 @@ class QuaternionBodies(AbstractBodyCoordinates):
     def redundant(self, q):
         return jnp.sum(q[3:] ** 2)[None] - 1
 
-    def _rates(self, p: Float[Array, "4"]) -> Float[Array, "3 4"]:
-        """`2 E(p)` in `Omega = 2 E(p) pdot`."""
-        a, b, c, d = p
-        rows = [[-b, a, d, -c], [-c, -d, a, b], [-d, c, -b, a]]
-        return 2 * jnp.stack([jnp.stack(row) for row in rows])
-
     def velocity_map(self, q):
         corner = jnp.zeros((3, 4), q.dtype)
         eye = jnp.eye(3, dtype=q.dtype)
-        return jnp.block([[eye, corner], [corner[:, :3], self._rates(q[3:])]])
+        return jnp.block([[eye, corner], [corner[:, :3], quaternion_rates(q[3:])]])
 
     def lift(self, q, v):
-        return jnp.concatenate([v[:3], 0.25 * v[3:] @ self._rates(q[3:])])
+        return jnp.concatenate([v[:3], 0.25 * v[3:] @ quaternion_rates(q[3:])])

@@ -1,4 +1,4 @@
-"""From a list of parts to a layout and its numbers."""
+"""Compiles a list of parts to a layout and its parameters."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,9 +12,8 @@ from jaxtyping import Array
 from .._programs import is_known
 from .._types import Coordinates
 from ._arguments import module_of, number
-from ._ends import Ends
+from ._ends import Ends, Hinge, Hinges
 from ._frames import Frame, GROUND, Numbers
-from ._hinges import Hinge, Hinges
 from ._laws import Alignment
 from ._layout import Layout, Link, numbers_of
 from ._parameters import Parameters
@@ -26,7 +25,7 @@ from .joints import AbstractJoint, Constraint
 
 
 def sort_parts(parts: Sequence[Any]) -> dict[type, list[Any]]:
-    """The parts by what they are, if names and plane or space fit together."""
+    """The parts by their class, after checks of their names and dimensions."""
     kinds = (
         AbstractBody, AbstractJoint, AbstractForce, AbstractDrive, Constraint, Potential,
     )  # fmt: skip
@@ -46,8 +45,8 @@ def sort_parts(parts: Sequence[Any]) -> dict[type, list[Any]]:
             raise TypeError(f"A name must be a string, got {part.name!r}.")
         if part.name == GROUND:
             raise ValueError(
-                f"The name '{GROUND}' is that of what stands still in every scene: give "
-                f"your {type(part).__name__} another."
+                f"The name '{GROUND}' is reserved for the fixed frame of every scene: "
+                f"choose another for your {type(part).__name__}."
             )
         if part.name in names:
             raise ValueError(f"There are two parts with the name '{part.name}'.")
@@ -72,7 +71,7 @@ def _world(body: AbstractBody) -> str:
 def compile_parts(
     found: dict[type, list[Any]], gravity: Any, own: dict[str, Any]
 ) -> tuple[Layout, Parameters]:
-    """Where all parts stand, and their numbers."""
+    """The layout of sorted parts and its parameters; `own` are those of the user."""
     bodies = found[AbstractBody]
     named = tuple((body.name, body.kind) for body in bodies)
     rows = numbers_of(named)
@@ -132,7 +131,7 @@ def _by_name(resolved: list[tuple]) -> dict[str, Numbers]:
 
 
 def _tables(groups: Sequence[Any], numbers: dict[str, Numbers]) -> tuple[Numbers, ...]:
-    """For every group one table for each of its numbers, one row for each part."""
+    """A dictionary of tables for each group, in which each part has one row."""
     tables = []
     for group in groups:
         members = [numbers[name] for name in group.names]
@@ -147,7 +146,7 @@ def _tables(groups: Sequence[Any], numbers: dict[str, Numbers]) -> tuple[Numbers
 
 
 class _StartPose:
-    """Finds the bodies that a part connects, as they start."""
+    """Finds the bodies that a part connects, in the start pose."""
 
     def __init__(self, bodies: Sequence[AbstractBody], rows: dict[str, int]):
         kinds = tuple((body.name, body.kind) for body in bodies)

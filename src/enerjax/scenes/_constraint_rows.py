@@ -1,4 +1,4 @@
-"""Which rows of the constraints belong to which part of a scene."""
+"""The rows of the constraints that belong to each part of a scene."""
 
 import jax
 import jax.numpy as jnp
@@ -14,14 +14,14 @@ from ._view import evaluate, View
 
 
 def members(layout: Layout) -> list[tuple[str, ...]]:
-    """The names of all joints, constraints and drives, as their rows follow each other."""
+    """The names of all joints, constraints and drives, in the order of their rows."""
     joined = [group.names for group in layout.joint_groups]
     joined += [(name,) for name, _ in layout.constraints]
     return joined + [group.names for group in layout.drive_groups]
 
 
 def rows_of(layout: Layout, q: Coordinates, args: Parameters) -> dict[str, slice]:
-    """The rows of each by name; those within bodies stand between joints and drives."""
+    """The rows of each part. Internal rows of bodies are between joints and drives."""
 
     def of_joints(q: Coordinates) -> list[Array]:
         view = View(layout, q)
@@ -54,11 +54,12 @@ def rows_of(layout: Layout, q: Coordinates, args: Parameters) -> dict[str, slice
 def check_reacting(
     joint: str, rows: dict[str, slice], ends: dict[str, tuple[str, str]]
 ) -> None:
-    """Raises for what is no joint or drive between two bodies."""
+    """Raises an error unless this is a joint or drive between two bodies."""
     if joint in rows and joint not in ends:
         raise ValueError(
-            f"'{joint}' is a constraint of your own, between no two bodies: it has "
-            f"`scene.multipliers(sol, '{joint}')`, and `-B^T` of these is its force."
+            f"'{joint}' is a constraint of your own, which connects no particular bodies. "
+            f"Its multipliers are `scene.multipliers(sol, '{joint}')`, and its force is "
+            "`-B^T lambda`."
         )
     if joint not in rows:
         joints = [name for name in rows if name in ends]
@@ -68,7 +69,7 @@ def check_reacting(
 def row_names(
     layout: Layout, q: Coordinates, args: Parameters, rows: dict[str, slice]
 ) -> list[str]:
-    """A name for each row of all constraints, in the order of multipliers."""
+    """The name of each row of the constraints, in the order of the multipliers."""
     inside = jax.eval_shape(lambda q: constraint(layout, q, args), q).size
     outside = jax.eval_shape(lambda q: redundancy(layout, q, args), q).size
     last = max([inside, *(place.stop for place in rows.values())])
@@ -83,19 +84,19 @@ def row_names(
 def first_dependent(
     layout: Layout, q: Coordinates, t: Real, args: Parameters, places: dict[str, slice]
 ) -> str | None:
-    """The first joint with a row that those before it determine already."""
+    """The first joint with a row that depends on those before it."""
     start = jnp.asarray(t, q.dtype)
-    held = []
+    gradients = []
     if layout.has_constraints:
-        held += [*jax.jacfwd(lambda x: constraint(layout, x, args))(q)]
+        gradients += [*jax.jacfwd(lambda x: constraint(layout, x, args))(q)]
     if layout.drives:
-        held += [*jax.jacfwd(lambda x: driven(layout, x, start, args))(q)]
-    joined = {k for place in places.values() for k in range(place.start, place.stop)}
-    # What bodies have of their own stands before.
-    taken = [row for k, row in enumerate(held) if k not in joined]
-    taken += [*jax.jacfwd(lambda x: redundancy(layout, x, args))(q)]
+        gradients += [*jax.jacfwd(lambda x: driven(layout, x, start, args))(q)]
+    of_parts = {k for place in places.values() for k in range(place.start, place.stop)}
+    # The internal rows of bodies count first.
+    rows = [row for k, row in enumerate(gradients) if k not in of_parts]
+    rows += [*jax.jacfwd(lambda x: redundancy(layout, x, args))(q)]
     for name, place in places.items():
-        taken += held[place]
-        if np.linalg.matrix_rank(np.array(taken)) < len(taken):
+        rows += gradients[place]
+        if np.linalg.matrix_rank(np.array(rows)) < len(rows):
             return name
     return None

@@ -1,4 +1,4 @@
-"""Bodies in motion: what a law with feedback may ask for."""
+"""The motion of a scene: positions, velocities and measures, for laws with feedback."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,7 @@ from jaxtyping import Array
 
 from .._types import Coordinates, Scalar, Vector, Velocities
 from ._frames import Numbers, Point
-from ._laws import AbstractPush, AbstractStored, Alignment, Driven, Length
+from ._laws import AbstractElastic, AbstractPush, Alignment, Driven, Length
 from ._layout import Layout, Links
 from ._measures import AbstractLaw, AbstractMeasure, PlanarTurn, Separation, Slide, Turn
 from ._parameters import Parameters
@@ -16,15 +16,14 @@ from ._view import evaluate, lift, View
 
 
 class Moving(View):
-    """A scene at its coordinates `q` and velocities `v`.
+    """A scene with the coordinates `q` and velocities `v`.
 
-    Besides what a `View` tells:
+    It has the methods of `View`, and:
 
     - `velocity(body, point)`: of a point of a body, in space.
-    - `angle(name)`, `length(name)`: of a part that has one, a hinge, a spring, a damper,
-      an actuator or a drive; `angle` also of a body in the plane. Angles in space are
-      counted from the start pose and within half a turn, where they jump (of a joint with
-      an `axis_b` from where its `frame_a` and `frame_b` agree).
+    - `angle(name)`, `length(name)`: of a hinge, spring, damper, actuator or drive; `angle`
+      also of a body in the plane. In space an angle is zero in the start pose (for a joint
+      with an `axis_b`, where its `frame_a` and `frame_b` agree), and jumps at half a turn.
     - `rate(name)`: of this angle or length. It does not jump.
     """
 
@@ -48,7 +47,7 @@ class Moving(View):
         return self._value(name, is_angle=False)
 
     def rate(self, name: str) -> Scalar:
-        """The rate of the angle or length of a part, of the angle of a body."""
+        """The rate of the angle or length of a part, or of the angle of a body."""
         if self._is_part(name):
             return self.measured(name)[1]
         return self._rate_of(lambda view: view.angle(name))
@@ -78,7 +77,7 @@ class Moving(View):
 
 
 def measure_of(layout: Layout, name: str) -> AbstractMeasure:
-    """What a part measures; raises for one that has no measure."""
+    """The measure of a part; an error if it has none."""
     found = measures_of(layout)
     if name not in found:
         raise ValueError(
@@ -99,7 +98,7 @@ def measures_of(layout: Layout) -> dict[str, AbstractMeasure]:
 
 
 def _measure(law: AbstractLaw, dimension: int, both_turn: bool) -> AbstractMeasure | None:
-    if isinstance(law, AbstractStored | AbstractPush | Driven):
+    if isinstance(law, AbstractElastic | AbstractPush | Driven):
         return law.measure
     if isinstance(law, Length):
         return Separation()
@@ -114,7 +113,7 @@ def _measure(law: AbstractLaw, dimension: int, both_turn: bool) -> AbstractMeasu
 
 
 def link_of(layout: Layout, name: str, args: Parameters) -> tuple[Links, Numbers]:
-    """A joint, force or drive alone, and its numbers, as a table of one row."""
+    """One joint, force or drive, and its numbers as tables with one row."""
     groups = dict(
         joints=layout.joint_groups, forces=layout.force_groups, drives=layout.drive_groups
     )

@@ -1,4 +1,4 @@
-"""Frames: what joints and forces know of a body."""
+"""Frames of bodies, of which joints and forces are functions."""
 
 from typing import Any, NamedTuple, TypeAlias
 
@@ -12,10 +12,10 @@ Numbers: TypeAlias = dict[str, Any]
 
 
 class Frame(NamedTuple):
-    """Where a body is: its origin, and its axes as the rows of a matrix, in space.
+    """The origin of a body, and its axes as the rows of a matrix, in space.
 
-    Fields that nothing reads are `None`. So are the axes where nothing turns, and the
-    frame is parallel to that of space.
+    Fields that a law does not read are `None`. So are the axes of bodies without an
+    orientation, whose frames stay parallel to that of space.
     """
 
     origin: Any = None
@@ -23,7 +23,7 @@ class Frame(NamedTuple):
     angle: Any = None
 
     def point(self, point: Point) -> Point:
-        """A point of the body in space: linear in the origin and the axes."""
+        """A point of the body in space, linear in the origin and the axes."""
         return self.origin + self.direction(point)
 
     def direction(self, direction: Point) -> Point:

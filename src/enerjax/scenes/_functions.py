@@ -1,7 +1,6 @@
 """The functions of `System` that a scene compiles to.
 
-All parts of a kind are evaluated at once, over tables of their numbers; parts that a scene
-does not have leave no trace.
+All parts of a kind are evaluated together, from tables of their numbers.
 """
 
 import equinox as eqx
@@ -57,7 +56,7 @@ def potential(layout: Layout, q: Coordinates, args: Parameters) -> Scalar:
 
 
 def _weight(view: View, args: Parameters) -> Scalar:
-    """The work of gravity from the origin."""
+    """The work of gravity on all bodies, from the origin to their positions."""
     work = jnp.zeros((), view.q.dtype)
     groups = view.layout.body_groups
     for group, numbers in zip(groups, args.tables["bodies"], strict=True):
@@ -94,7 +93,7 @@ def driven(layout: Layout, q: Coordinates, t: Scalar, args: Parameters) -> Multi
 def drives_at(
     layout: Layout, t: Scalar, args: Parameters
 ) -> list[tuple[Links, dict[str, Array]]]:
-    """All drives, with the values that they prescribe now among their numbers."""
+    """All drives, with numbers that include the values that they prescribe at time `t`."""
     groups = zip(layout.drive_groups, args.tables["drives"], strict=True)
     return [(group, at_time(group, numbers, t, args)) for group, numbers in groups]
 
@@ -106,9 +105,9 @@ def at_time(
     args: Parameters,
     view: Moving | None = None,
 ) -> dict[str, Array]:
-    """With the value of the signal, if there is one: the same for all links.
+    """The numbers of a group, with the value of its signal if it has one.
 
-    Forces may ask for the `view`, drives may not.
+    All links of a group have the same signal. Those of forces may depend on the `view`.
     """
     assert isinstance(group.law, AbstractPush | Driven)
     if group.law.signal is None:

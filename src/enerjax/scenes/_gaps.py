@@ -1,4 +1,4 @@
-"""How far joints are from closed, by their bodies' own measure."""
+"""The gaps of joints: how far they are from closed."""
 
 from typing import NamedTuple, TypeAlias
 
@@ -15,15 +15,15 @@ from ._laws import Driven, Length, Missed
 from ._layout import Layout, Links
 from ._measures import Separation, Slide
 from ._parameters import Parameters
-from ._relative_motions import moved, pivot_of, still
+from ._relative_motions import moved, no_motion, pivot_of
 from ._user_functions import vector_of
 from ._view import evaluate, View
 
 
 class Gap(NamedTuple):
-    """How far a joint is from closed: lengths, and lengths per time.
+    """How far a joint is from closed: a length, and a length per time.
 
-    Angles count as the length of an arc over the size of its bodies.
+    An angle counts as the length of its arc, with the size of the bodies as radius.
     """
 
     position: float
@@ -31,7 +31,7 @@ class Gap(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """A gap, with the size and the speed of the bodies that the joint connects."""
+    """A gap, and the size and speed of the bodies that the joint connects."""
 
     position: float
     velocity: float
@@ -39,7 +39,7 @@ class Measured(NamedTuple):
     speed: float
 
 
-# The same of all joints of a group.
+# The entries of `Measured` for all joints of a group.
 Columns: TypeAlias = tuple[Array, Array, Array, Array]
 
 
@@ -47,7 +47,7 @@ Columns: TypeAlias = tuple[Array, Array, Array, Array]
 def measured(
     layout: Layout, q: Coordinates, qdot: Coordinates, t: Scalar, args: Parameters
 ) -> list[Columns]:
-    """For every group of joints; then for every own constraint, last for drives."""
+    """The gaps of every group of joints, then of the user's constraints, then of drives."""
     joints = list(zip(layout.joint_groups, args.tables["joints"], strict=True))
     drives = drives_at(layout, t, args)
     bodies = _Bodies(layout, q, qdot, args, [*joints, *drives])
@@ -89,7 +89,7 @@ def by_name(layout: Layout, found: list[Columns]) -> dict[str, Measured]:
 
 
 class _Bodies:
-    """Sizes and speeds of the bodies that joints connect."""
+    """The sizes and speeds of the bodies that joints connect."""
 
     def __init__(
         self,
@@ -105,7 +105,7 @@ class _Bodies:
         for group, numbers in links:
             arms = _arms(group, numbers, q)
             sizes = sizes.at[group.a].max(arms).at[group.b].max(arms)
-        self.sizes = sizes.at[0].set(0)  # the ground has none
+        self.sizes = sizes.at[0].set(0)  # the ground has no size
 
         def frames(x: Coordinates) -> tuple[Array, Array]:
             view = View(layout, x)
@@ -118,7 +118,7 @@ class _Bodies:
     def compared(
         self, group: Links, numbers: Numbers, pair: tuple[Array, Array]
     ) -> Columns:
-        """The gaps of a group whose rows, and their rates, are these."""
+        """The gaps of a group, from its rows and their rates."""
         size = jnp.maximum(self.sizes[group.a], self.sizes[group.b])
         size = jnp.where(size > 0, size, self.extent)
         speed = [self.speeds[k] + self.spins[k] * size for k in (group.a, group.b)]
@@ -129,13 +129,13 @@ class _Bodies:
     def _slopes(
         self, group: Links, numbers: Numbers, size: Float[Array, " joints"]
     ) -> Float[Array, "joints rows"]:
-        """How fast every row changes with a motion of the second body."""
+        """The derivative of every row with respect to a motion of the second body."""
 
         def slope(a: Frame, b: Frame, numbers: Numbers, size: Scalar) -> Array:
             pivot = pivot_of(b, numbers)
             rows = lambda shift, turn: group.law(a, moved(b, pivot, shift, turn), numbers)
-            rest = still(pivot.size, pivot.dtype)
-            shift, turn = jax.jacfwd(rows, argnums=(0, 1))(*rest)
+            zero = no_motion(pivot.size, pivot.dtype)
+            shift, turn = jax.jacfwd(rows, argnums=(0, 1))(*zero)
             return jnp.linalg.norm(jnp.concatenate([shift, turn / size], axis=1), axis=1)
 
         view = self.view
@@ -150,7 +150,7 @@ def _never_zero(slope: Array) -> Array:
 
 
 def _arms(group: Links, numbers: Numbers, q: Coordinates) -> Float[Array, " joints"]:
-    """How far from their mass centres bodies are held, or from each other."""
+    """The distance of the joints' points from mass centres, or of the bodies they hold."""
     arms = jnp.zeros((len(group.names),), q.dtype)
     for side, key in ((group.a, "point_a"), (group.b, "point_b")):
         if key in numbers:
@@ -164,7 +164,7 @@ def _arms(group: Links, numbers: Numbers, q: Coordinates) -> Float[Array, " join
 
 
 def _extent(view: View, args: Parameters) -> Scalar:
-    """The size of the scene: of its bodies and of the points of its joints."""
+    """The size of the scene, including the points of its joints."""
     points = [view.origins]
     groups = view.layout.joint_groups
     for group, numbers in zip(groups, args.tables["joints"], strict=True):

@@ -1,9 +1,8 @@
-"""What joints and forces compute from the frames of two bodies.
+"""The laws of joints, forces and drives: functions of the frames of two bodies.
 
-Laws are plain functions of one joint; those of a kind are evaluated together. Like kinds of
-bodies they are compared by value. Constraints are made of differences of points and of dot
-products of body-fixed directions: the chain rule for difference quotients keeps energy and
-momenta of these to round-off.
+Laws are compared by value, and equal ones are evaluated together. Constraints consist of
+differences of points and dot products of body-fixed directions, because with these the
+chain rule for difference quotients conserves energy and momenta to round-off.
 """
 
 import abc
@@ -22,9 +21,10 @@ from ._measures import AbstractLaw, AbstractMeasure, offset
 
 @dataclass(frozen=True)
 class Alignment(AbstractLaw):
-    """Points stay together, axes stay perpendicular.
+    """Keeps two points together and pairs of axes perpendicular.
 
-    - `along`: axes of the first frame along which the points may not part; `None` for all.
+    - `along`: the axes of the first frame along which the points must coincide; `None` if
+      they must coincide altogether.
     - `square`: pairs of axes, of the first and second frame, that stay perpendicular.
     """
 
@@ -37,12 +37,12 @@ class Alignment(AbstractLaw):
 
     @property
     def keeps_directions(self) -> bool:
-        """Whether the second frame does not turn against the first."""
+        """Whether the second frame cannot turn relative to the first."""
         return len(self.square) == 3
 
     @property
     def keeps_axis(self) -> bool:
-        """Whether the last axis of the first frame stays one of the second."""
+        """Whether the last axis of both frames stays the same."""
         return self.square == ((2, 0), (2, 1))
 
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Multipliers:
@@ -75,8 +75,8 @@ class Curve(AbstractLaw):
         return self.function(apart, numbers)
 
 
-class AbstractStored(AbstractLaw):
-    """An energy that depends on a measure; its force is minus the slope."""
+class AbstractElastic(AbstractLaw):
+    """A potential energy of a measure; the force along the measure is minus its slope."""
 
     measure: AbstractMeasure
 
@@ -93,8 +93,8 @@ class AbstractStored(AbstractLaw):
 
 
 @dataclass(frozen=True)
-class Elastic(AbstractStored):
-    """A linear spring, without force where the measure is `numbers[rest]`."""
+class Elastic(AbstractElastic):
+    """A linear spring, whose force vanishes if the measure is `numbers[rest]`."""
 
     measure: AbstractMeasure
     rest: str
@@ -104,8 +104,8 @@ class Elastic(AbstractStored):
 
 
 @dataclass(frozen=True)
-class Steady(AbstractStored):
-    """A push that is `numbers[load]` for good."""
+class Steady(AbstractElastic):
+    """A constant force `numbers[load]` along a measure."""
 
     measure: AbstractMeasure
     load: str
@@ -114,7 +114,7 @@ class Steady(AbstractStored):
         return -jnp.sum(numbers[self.load] * value)
 
 
-# Laws that time or velocities enter -----------------------------------------------------
+# Laws that depend on time or velocities -------------------------------------------------
 
 # A function of time and of the `args` of the system.
 Signal = TypeAliasType("Signal", Callable[[Scalar, Args], Array])
@@ -122,7 +122,7 @@ Signal = TypeAliasType("Signal", Callable[[Scalar, Args], Array])
 
 @dataclass(frozen=True)
 class Driven(AbstractLaw):
-    """A measure that is held at a value of the time, which `numbers["value"]` is now."""
+    """Keeps a measure at the value of a signal, which is in `numbers["value"]`."""
 
     measure: AbstractMeasure
     signal: Signal
@@ -137,7 +137,7 @@ class Driven(AbstractLaw):
 
 @dataclass(frozen=True)
 class Missed(AbstractLaw):
-    """How far a drive is from `numbers["value"]`."""
+    """The difference of a driven measure from `numbers["value"]`."""
 
     measure: AbstractMeasure
 
@@ -150,7 +150,7 @@ class Missed(AbstractLaw):
 
 
 class AbstractPush(AbstractLaw):
-    """A force along a measure, that no potential has."""
+    """A force along a measure that has no potential."""
 
     measure: AbstractMeasure
     signal: Callable[..., Array] | None
@@ -164,7 +164,7 @@ class AbstractPush(AbstractLaw):
 
     @abc.abstractmethod
     def push(self, b: Frame, rate: Array, numbers: Numbers) -> Array:
-        """The force, for the rate of the measure."""
+        """The force for this rate of the measure."""
 
 
 @dataclass(frozen=True)
@@ -178,9 +178,9 @@ class Viscous(AbstractPush):
 
 @dataclass(frozen=True)
 class Acting(AbstractPush):
-    """A force that is `numbers["value"]` now.
+    """A force with the value of a signal, which is in `numbers["value"]`.
 
-    With `feedback` its signal is a function of the bodies in motion too.
+    With `feedback` the signal also depends on the motion of the bodies.
     """
 
     measure: AbstractMeasure
@@ -193,7 +193,7 @@ class Acting(AbstractPush):
 
 @dataclass(frozen=True)
 class Following(Acting):
-    """A force that is told in the axes of its body."""
+    """A force whose signal is a vector in the axes of its body."""
 
     def push(self, b: Frame, rate: Array, numbers: Numbers) -> Array:
         return b.direction(numbers["value"])

@@ -1,4 +1,4 @@
-"""Where the parts of a scene stand: tables of integers, known before anything is traced."""
+"""The structure of a scene as tables of integers, which are known before tracing."""
 
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from ._measures import AbstractLaw
 
 
 class Link(NamedTuple):
-    """A joint, drive or force: its law, and the numbers of its bodies; the ground is 0."""
+    """A joint, drive or force: its law, and the indices of its bodies (0 is the ground)."""
 
     name: str
     law: AbstractLaw
@@ -23,7 +23,7 @@ class Link(NamedTuple):
 
 
 class Bodies(NamedTuple):
-    """All bodies of a kind: names, and their coordinates and velocities, row by row."""
+    """All bodies of a kind, with a row of indices of coordinates and velocities each."""
 
     kind: AbstractBodyCoordinates
     names: tuple[str, ...]
@@ -32,7 +32,7 @@ class Bodies(NamedTuple):
 
 
 class Links(NamedTuple):
-    """All joints, drives or forces of a law."""
+    """All joints, drives or forces with the same law."""
 
     law: AbstractLaw
     names: tuple[str, ...]
@@ -44,8 +44,9 @@ class Links(NamedTuple):
 class Layout:
     """The structure of a scene, without its numbers; compared by value.
 
-    Coordinates and velocities stand body by body, in the order of the parts. Bodies are
-    numbered kind by kind from 1 on, so that a table of all frames is a concatenation.
+    Coordinates and velocities are ordered like the bodies among the parts. The frames of
+    bodies are numbered kind by kind, starting from 1, so that a table of all frames is a
+    concatenation.
     """
 
     dimension: int
@@ -61,11 +62,11 @@ class Layout:
     def body_groups(self) -> tuple[Bodies, ...]:
         sizes = [(k.num_coordinates, k.num_velocities) for _, k in self.bodies]
         starts = np.concatenate([np.zeros((1, 2), int), np.cumsum(sizes, axis=0)])
-        place = {name: k for k, (name, _) in enumerate(self.bodies)}
+        position = {name: k for k, (name, _) in enumerate(self.bodies)}
         groups = []
         for kind, members in _grouped(self.bodies, lambda body: body[1]):
             names = tuple(name for name, _ in members)
-            first = starts[[place[name] for name in names]]
+            first = starts[[position[name] for name in names]]
             q = first[:, :1] + np.arange(kind.num_coordinates)
             v = first[:, 1:] + np.arange(kind.num_velocities)
             groups.append(Bodies(kind, names, q, v))
@@ -78,7 +79,7 @@ class Layout:
 
     @cached_property
     def turning(self) -> np.ndarray:
-        """Which rows of a table of frames turn."""
+        """Which rows of a table of frames belong to bodies with an orientation."""
         flags = [[group.kind.turns] * len(group.names) for group in self.body_groups]
         return np.array([False, *sum(flags, [])])
 
@@ -105,7 +106,7 @@ class Layout:
 
     @cached_property
     def places(self) -> dict[str, dict[str, tuple[int, int]]]:
-        """Group and row of every part, section by section."""
+        """The group and the row of every part, for each section of the parameters."""
         sections = dict(
             bodies=self.body_groups,
             joints=self.joint_groups,
@@ -131,7 +132,7 @@ class Layout:
 
 
 def numbers_of(bodies: Iterable[tuple[str, AbstractBodyCoordinates]]) -> dict[str, int]:
-    """The ground is 0; bodies follow kind by kind."""
+    """The row of each body in a table of frames: first the ground, then kind by kind."""
     groups = _grouped(bodies, lambda body: body[1])
     names = [name for _, members in groups for name, _ in members]
     return {name: k for k, name in enumerate([GROUND, *names])}
@@ -150,7 +151,7 @@ def _links(links: tuple[Link, ...]) -> tuple[Links, ...]:
 
 
 def _grouped(items: Iterable[Any], key: Callable[[Any], Hashable]) -> list[tuple]:
-    """Items of like keys together, in the order in which the keys appear."""
+    """The items with equal keys together, in the order in which the keys first appear."""
     groups: dict[Any, list] = {}
     for item in items:
         groups.setdefault(key(item), []).append(item)

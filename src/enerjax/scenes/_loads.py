@@ -1,4 +1,4 @@
-"""Forces without a potential; they are public in `forces`."""
+"""Forces without a potential, which users find in `forces`."""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,19 +16,19 @@ from ._part import AbstractForce
 from ._user_functions import takes_view
 
 
-# What a program gives: a function of time, or of the bodies in motion too.
-Program = TypeAliasType(
-    "Program", Callable[[Scalar, Args], Array] | Callable[[Any, Scalar, Args], Array]
+# A function (t, args), or (view, t, args) with feedback.
+ForceFunction = TypeAliasType(
+    "ForceFunction", Callable[[Scalar, Args], Array] | Callable[[Any, Scalar, Args], Array]
 )
 
 
 class Damper(AbstractForce):
-    """A viscous damper between two points, along their line: `-damping * rdot`.
+    """A viscous damper along the line between two points: `-damping * rdot`.
 
-    Points that are not given are the origins of the frames; they must not meet.
-    `damping` is a force per velocity and not negative. It takes energy out in every step,
-    however long, with `EnergyPreserving` and `EnergyConsistent`; with the decaying schemes
-    this is certain only where the line keeps its direction.
+    Points default to the origins of the frames, and must not coincide. `damping` is a force
+    per velocity, not negative. With `EnergyPreserving` and `EnergyConsistent` it removes
+    energy in every step of any length. With the decaying schemes this is certain only if
+    the line keeps its direction.
     """
 
     damping: Real
@@ -36,15 +36,15 @@ class Damper(AbstractForce):
     point_b: Vector | None = None
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
-        points, _ = ends.apart(self.point_a, self.point_b)
+        points, _ = ends.separate_points(self.point_a, self.point_b)
         return Viscous(Separation()), points | _damping(ends, self.damping)
 
 
 class TorsionDamper(AbstractForce):
     """A viscous damper of the angle between two bodies: a torque `-damping * rate`.
 
-    In space about `axis`, told in the first body, which revolute or cylindrical joints must
-    keep common to both bodies. Full turns do not matter.
+    In space it acts about `axis`, in the frame of the first body. Revolute or cylindrical
+    joints must keep this axis common to both bodies.
     """
 
     damping: Real
@@ -60,27 +60,28 @@ def _damping(ends: Ends, damping: Real) -> Numbers:
 
 
 class Actuator(AbstractForce):
-    """A force between two points that a program gives: `force(t, args)`.
+    """A force between two points that a function defines: `force(t, args)`.
 
-    A scalar, along the line of the points; positive, it pushes them apart. Points that
-    are not given are the origins of the frames; they must not meet.
+    It is a scalar along the line between the points; a positive force pushes them apart.
+    Points default to the origins of the frames, and must not coincide.
 
-    With feedback a `force(view, t, args)`. `view` tells of the bodies as they move:
+    With feedback it is a `force(view, t, args)`, where `view` describes the motion:
 
     - `view.position(body, point)`, `view.velocity(body, point)`: in space, shape `(d,)`
-      (length, length per time); the mass centre if no point is given. `view.direction`.
+      (length, length per time); of the mass centre by default. `view.direction(body,
+      axis)`.
     - `view.length(name)`, `view.angle(name)`: of a spring, damper, actuator, joint or drive
       that has one (radians); `view.angle` also of a body in the plane. About a hinge in
-      space the angle is counted from the start pose and lies within half a turn, where it
-      jumps: for more than that use its sine and cosine.
-    - `view.rate(name)`: of this length or angle. It has no jumps.
+      space the angle is zero in the start pose and jumps at half a turn: beyond, use its
+      sine and cosine.
+    - `view.rate(name)`: of this length or angle. It does not jump.
     - `view.q`, `view.v`: all coordinates and velocities.
 
-    Schemes ask in the middle of a step, and its work there is that of the audit: feedback
-    is exact in the balance of every step, and of order 2.
+    Schemes evaluate the force in the middle of a step, and the audit counts its work there:
+    the energy balance of every step is exact, and the motion is of order 2.
     """
 
-    force: Program
+    force: ForceFunction
     point_a: Vector | None = None
     point_b: Vector | None = None
 
@@ -88,21 +89,21 @@ class Actuator(AbstractForce):
         takes_view(self.name, "force", self.force)
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
-        points, _ = ends.apart(self.point_a, self.point_b)
+        points, _ = ends.separate_points(self.point_a, self.point_b)
         feedback = takes_view(self.name, "force", self.force)
         return Acting(Separation(), self.force, feedback), points
 
 
 class TorsionActuator(AbstractForce):
-    """A torque between two bodies that a program gives: `torque(t, args)`, a scalar.
+    """A torque between two bodies that a function defines: `torque(t, args)`, a scalar.
 
-    It turns the second body counterclockwise, in space about `axis` as `TorsionDamper`,
-    and its opposite acts on the first. With feedback a `torque(view, t, args)`, a servo;
-    `view` tells what it does to an `Actuator`, so `view.angle(name)` and `view.rate(name)`
-    of the actuator itself are the angle between its bodies and the rate.
+    It turns the second body counterclockwise, in space about `axis` (see `TorsionDamper`),
+    and its opposite acts on the first body. With feedback, as for a servo, it is a
+    `torque(view, t, args)`; see `Actuator`. `view.angle(name)` and `view.rate(name)` of the
+    actuator itself are the angle between its bodies and its rate.
     """
 
-    torque: Program
+    torque: ForceFunction
     axis: Vector | None = None
 
     def __check_init__(self):
@@ -115,16 +116,18 @@ class TorsionActuator(AbstractForce):
 
 
 class Load(AbstractForce):
-    """A force on a point of a `body` that a program gives in space: `force(t, args)`.
+    """A force on a point of a `body` that a function defines in space: `force(t, args)`.
 
-    A vector; `point` is the mass centre if it is not given. With feedback a
-    `force(view, t, args)`, as of an `Actuator`.
+    It is a vector; `point` defaults to the mass centre. With feedback it is a
+    `force(view, t, args)`; see `Actuator`.
     """
 
-    force: Program
+    force: ForceFunction
     point: Vector | None
 
-    def __init__(self, name: str, body: str, force: Program, point: Vector | None = None):
+    def __init__(
+        self, name: str, body: str, force: ForceFunction, point: Vector | None = None
+    ):
         self.name, self.a, self.b = name, GROUND, body
         self.force, self.point = force, point
 
@@ -132,18 +135,19 @@ class Load(AbstractForce):
         takes_view(self.name, "force", self.force)
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
-        point = ends.origins(None, self.point)["point_b"]
         feedback = takes_view(self.name, "force", self.force)
-        return Acting(Place(), self.force, feedback), dict(point_b=point)
+        return Acting(Place(), self.force, feedback), ends.point_of_body(self.point)
 
 
 class Follower(AbstractForce):
-    """A force that turns with its `body`: as `Load`, but told in the axes of the body."""
+    """A force that turns with its `body`: a `Load` in the axes of the body."""
 
-    force: Program
+    force: ForceFunction
     point: Vector | None
 
-    def __init__(self, name: str, body: str, force: Program, point: Vector | None = None):
+    def __init__(
+        self, name: str, body: str, force: ForceFunction, point: Vector | None = None
+    ):
         self.name, self.a, self.b = name, GROUND, body
         self.force, self.point = force, point
 
@@ -152,6 +156,5 @@ class Follower(AbstractForce):
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         ends.only_bodies_that_turn()
-        point = ends.origins(None, self.point)["point_b"]
         feedback = takes_view(self.name, "force", self.force)
-        return Following(Place(), self.force, feedback), dict(point_b=point)
+        return Following(Place(), self.force, feedback), ends.point_of_body(self.point)

@@ -1,7 +1,8 @@
-"""Functions of the frames of two bodies, and those with a number for a value: measures.
+"""Laws and measures: functions of the frames of two bodies.
 
-Springs stretch along a measure, forces work along one (a push `F` along `x` has the power
-`F xdot`), and drives prescribe one; the multiplier of a drive is minus its force or torque.
+The energy of a spring is a function of a measure, a force acts along a measure (`F` along
+`x` has the power `F xdot`), and a drive prescribes one. The multiplier of a drive is minus
+its force or torque.
 """
 
 import abc
@@ -16,38 +17,38 @@ from ._frames import Frame, Numbers, Point
 
 
 class AbstractLaw(abc.ABC):
-    """A function of the frames of two bodies; `reads` are the fields of a frame in use."""
+    """A function of the frames of two bodies; `reads` names the fields that it uses."""
 
     reads: ClassVar[tuple[str, ...]] = ("origin", "axes")
 
     @abc.abstractmethod
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Any:
-        """Rows that vanish, of a joint; an energy, of a force; the value of a measure."""
+        """The constraint of a joint, the energy of a force, or the value of a measure."""
 
 
 def offset(a: Frame, b: Frame, numbers: Numbers) -> Point:
-    """From the point on the first body to the one on the second."""
+    """The vector from the point on the first body to that on the second."""
     return b.point(numbers["point_b"]) - a.point(numbers["point_a"])
 
 
 class AbstractMeasure(AbstractLaw):
-    """A length, an angle (`is_angle`), or a place (`is_vector`, one in space)."""
+    """A length, an angle (`is_angle`), or a position (`is_vector`)."""
 
     is_angle: ClassVar[bool] = False
     is_vector: ClassVar[bool] = False
 
     def away(self, a: Frame, b: Frame, numbers: Numbers, value: Any) -> Multipliers:
-        """Rows that vanish where the measure has this value, of slope one there."""
+        """Rows that vanish if the measure has this value, and have slope one there."""
         return (self(a, b, numbers) - value).reshape(-1)
 
     def missed(self, a: Frame, b: Frame, numbers: Numbers, value: Any) -> Multipliers:
-        """How far the measure is from this value, for reports."""
+        """The difference of the measure from this value, for reports."""
         return self.away(a, b, numbers, value)
 
 
 @dataclass(frozen=True)
 class Separation(AbstractMeasure):
-    """The distance of two points."""
+    """The distance between two points."""
 
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Scalar:
         return jnp.sqrt(jnp.sum(offset(a, b, numbers) ** 2))
@@ -55,17 +56,17 @@ class Separation(AbstractMeasure):
 
 @dataclass(frozen=True)
 class Slide(AbstractMeasure):
-    """How far the second point is along an axis of the first body."""
+    """The component of the offset along an axis of the first body."""
 
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Scalar:
         apart = offset(a, b, numbers)
-        axis = 0 if apart.size == 2 else 2  # of a `basis`
+        axis = 0 if apart.size == 2 else 2  # see `basis`
         return jnp.sum(apart * a.direction(numbers["frame_a"][axis]))
 
 
 @dataclass(frozen=True)
 class Place(AbstractMeasure):
-    """Where a point of the second body is."""
+    """The position of a point of the second body."""
 
     is_vector = True
 
@@ -86,7 +87,8 @@ class PlanarTurn(AbstractMeasure):
 
 @dataclass(frozen=True)
 class Turn(AbstractMeasure):
-    """The angle about a common axis in space: it jumps at half a turn, but not its rate."""
+    """The angle about a common axis in space, which jumps at half a turn; its rate does
+    not."""
 
     is_angle = True
     reads = ("axes",)
@@ -96,18 +98,18 @@ class Turn(AbstractMeasure):
         return jnp.arctan2(across, along)
 
     def away(self, a: Frame, b: Frame, numbers: Numbers, value: Any) -> Multipliers:
-        # The sine of the difference: smooth over any number of turns.
+        # The sine of the difference is smooth over any number of turns.
         return self._turned_back(a, b, numbers, value)[1].reshape(-1)
 
     def missed(self, a: Frame, b: Frame, numbers: Numbers, value: Any) -> Multipliers:
-        # The sine vanishes half a turn away too.
+        # The sine also vanishes half a turn away from the value, so the angle is reported.
         along, across = self._turned_back(a, b, numbers, value)
         return jnp.arctan2(across, along).reshape(-1)
 
     def _turned_back(
         self, a: Frame, b: Frame, numbers: Numbers, value: Any
     ) -> tuple[Scalar, Scalar]:
-        """Cosine and sine of the angle less a value."""
+        """Cosine and sine of the difference of the angle and a value."""
         along, across = self._components(a, b, numbers)
         c, s = jnp.cos(value), jnp.sin(value)
         return along * c + across * s, across * c - along * s
@@ -119,9 +121,10 @@ class Turn(AbstractMeasure):
 
 
 def turn_of(ends: Ends, axis: Vector | None) -> tuple[AbstractMeasure, Numbers]:
-    """The angle between two bodies, in space about an axis; its numbers."""
+    """The measure of the angle between two bodies, in space about an axis, and its
+    numbers."""
     if ends.dimension == 2:
         ends.refuse_axes(axis)
         ends.only_bodies_that_turn()
         return PlanarTurn(), {}
-    return Turn(), ends.about(axis)
+    return Turn(), ends.common_axis(axis)

@@ -1,4 +1,4 @@
-"""The numbers of a scene, found by name and kept kind by kind."""
+"""The numbers of a scene, which are accessed by name and stored kind by kind."""
 
 import textwrap
 from collections.abc import Iterator, Mapping
@@ -15,13 +15,13 @@ from ._layout import Layout
 
 
 class Parameters(eqx.Module):
-    """All numbers of a scene: what its system takes as `args`.
+    """All numbers of a scene: the `args` of its system.
 
-    `args["bodies"]["crank"]["mass"]`, `args["joints"]["pin"]["point_b"]`,
-    `args["forces"]["spring"]["stiffness"]`, `args["gravity"]`, and what you gave to the
-    scene as `args` under your own names. Read so, and changed with `set`: the leaves of
-    this tree are tables, one row for each part of a kind, so that a hundred rods make the
-    same program as one. Gradients with respect to it are read by name too.
+    They are read as `args["bodies"]["crank"]["mass"]`, `args["joints"]["pin"]["point_b"]`,
+    `args["forces"]["spring"]["stiffness"]` or `args["gravity"]`, and those that you passed
+    to the scene as `args` by their own names. `set` returns a copy with other values. The
+    leaves of this pytree are tables with one row for each part of a kind, so that a hundred
+    rods need no larger program than one. Gradients are read by name too.
     """
 
     tables: dict[str, tuple[Numbers, ...]]
@@ -35,16 +35,16 @@ class Parameters(eqx.Module):
         _refuse(key)
 
     def __str__(self) -> str:
-        lines = [f"{key} = {_told(value)}" for key, value in self.own.items()]
+        lines = [f"{key} = {_text(value)}" for key, value in self.own.items()]
         for section in self.tables:
             lines += [f"{section}:", textwrap.indent(str(self[section]), "    ")]
         return "\n".join(line for line in lines if line.strip())
 
     def set(self, name: str | None = None, /, **numbers: Any) -> "Parameters":
-        """With other numbers of a part, or without a name others of your own.
+        """A copy with other numbers of a part, or of your own if no name is passed.
 
-        `args.set("crank", mass=2.0)`, `args.set(gravity=[0.0, -1.62])`. Lengths and
-        points change the joints: make a new start with `scene.start(args)`.
+        `args.set("crank", mass=2.0)`, `args.set(gravity=[0.0, -1.62])`. New lengths and
+        points change the joints and require a new start, `scene.start(args)`.
 
         **Raises:** `ValueError` for a part or number that does not exist.
         """
@@ -67,7 +67,7 @@ class Parameters(eqx.Module):
 
 
 def _like(old: Mapping[str, Any], key: str, value: Any) -> Any:
-    """A new value in the place of an old one, of its type and shape."""
+    """A new value with the type and shape of the old one."""
     if key not in old:
         raise ValueError(f"There is no `{key}`; there are {sorted(old)}.")
     if not eqx.is_array(old[key]):
@@ -81,7 +81,7 @@ def _like(old: Mapping[str, Any], key: str, value: Any) -> Any:
 
 
 class _ReadOnly(Mapping):
-    """What is found by name, and changed with `Parameters.set` alone."""
+    """A mapping that explains `Parameters.set` when it is assigned to."""
 
     _entries: Mapping[str, Any]
 
@@ -124,7 +124,7 @@ class _Section(_ReadOnly):
 
 @jax.tree_util.register_pytree_node_class
 class _Part(_ReadOnly):
-    """The numbers of one part; a tree of them, as a dictionary is."""
+    """The numbers of one part; a pytree, like a dictionary."""
 
     def __init__(self, numbers: Numbers):
         self._entries = numbers
@@ -133,7 +133,7 @@ class _Part(_ReadOnly):
         return self._entries[name]
 
     def __repr__(self) -> str:
-        return ", ".join(f"{name} = {_told(x)}" for name, x in self.items())
+        return ", ".join(f"{name} = {_text(x)}" for name, x in self.items())
 
     def tree_flatten(self) -> tuple[tuple[Numbers], None]:
         return (dict(self._entries),), None
@@ -143,8 +143,8 @@ class _Part(_ReadOnly):
         return cls(*numbers)
 
 
-def _told(value: Any) -> str:
-    """Numbers as one would write them; what is traced by its shape."""
+def _text(value: Any) -> str:
+    """The values of an array, or its type if it is traced."""
     if isinstance(value, jax.Array) and not is_known(value):
         return str(jax.typeof(value))
     if eqx.is_array(value):

@@ -1,6 +1,7 @@
-"""What joints, forces and drives have in common."""
+"""The interface of joints, forces and drives."""
 
 import abc
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -28,18 +29,33 @@ class AbstractPart(eqx.Module):
 
     @abc.abstractmethod
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
-        """Its law and its numbers, from the start pose of its bodies."""
+        """The law and the numbers of the part, from the start pose of its bodies."""
 
 
 class AbstractForce(AbstractPart):
-    """A force of a scene; its law is that of its energy, or of its push."""
+    """A force of a scene; its law is an `AbstractElastic` or an `AbstractPush`."""
 
 
 class AbstractFunctionOfPose(eqx.Module):
-    """What a scene takes from a function of its user, `function(view, args)`."""
+    """A part that is a user's function of the pose, `function(view, args)`."""
 
     name: eqx.AbstractVar[str]
     function: eqx.AbstractVar[PoseFunction]
 
     def __check_init__(self):
         check_function(self.name, "function", self.function, "view", "args")
+
+
+def only_parts(names: dict[str, Any]) -> Callable[[], list[str]]:
+    """A `__dir__` that lists only the classes of parts among the names of a module."""
+
+    def parts() -> list[str]:
+        return sorted(
+            name
+            for name, value in names.items()
+            if inspect.isclass(value)
+            and issubclass(value, eqx.Module)
+            and not name.startswith("Abstract")
+        )
+
+    return parts

@@ -1,4 +1,4 @@
-"""Lengths, angles and forces of parts, along runs."""
+"""Lengths, angles and forces of parts along runs."""
 
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ from .._system import State
 from .._types import Real, Scalar
 from ._feedback import link_of, measure_of, Moving
 from ._functions import at_time, pushes
-from ._laws import AbstractPush, AbstractStored, Driven, Length
+from ._laws import AbstractElastic, AbstractPush, Driven, Length
 from ._layout import Layout
 from ._measures import Turn
 from ._parameters import Parameters
@@ -20,23 +20,24 @@ from ._relative_motions import each
 
 
 class Readout(NamedTuple):
-    """What a part measures.
+    """The length or angle of a part, its rate, and the force along it.
 
-    Shape `(times,)`, of one state `()`; of a part that acts on a point (`Load`,
-    `Follower`, `ConstantForce`, `Position`) `(times, d)`, in space.
+    The shape is `(times,)`, for one state `()`; for a part that acts on a point (`Load`,
+    `Follower`, `ConstantForce`, `Position`) it is `(times, d)`, in space.
 
-    - `value`: a length, an angle (radians), or a place (a vector of lengths).
+    - `value`: a length, an angle (radians), or a position (a vector of lengths).
     - `rate`: its rate (length per time, radians per time).
-    - `force`: along it: a force (energy per length), of an angle a torque (energy). It is
-      positive where it pushes points apart or turns the second body counterclockwise, so
-      `force * rate` is its power. `None` where the part has none. That of a drive or a rod
-      (`Distance`) is known of multipliers, so not of a `State`; of a run it is a mean over
-      the step that ends at the row, and that of all others at the row itself.
+    - `force`: a force (energy per length), or a torque (energy) for an angle. It is
+      positive if it pushes points apart or turns the second body counterclockwise, so
+      `force * rate` is its power. `None` if the part has no force. The force of a drive or
+      a rod (`Distance`) follows from multipliers: it is not known for a `State`, and for a
+      run it is the mean over the step that ends at the row.
 
-    Joints tell an angle if they are hinges (a cylindrical joint too), else how far they
-    slide. In the plane it is the difference of the angles of the bodies; in space it is
-    counted from the start pose, of a joint with an `axis_b` from where its `frame_a` and
-    `frame_b` agree. A torsion spring in space keeps to the angle within half a turn.
+    The value of a revolute or cylindrical joint is its angle, that of a prismatic joint its
+    displacement. In the plane an angle is the difference of the angles of the bodies. In
+    space it is zero in the start pose (for a joint with an `axis_b`, where its `frame_a`
+    and `frame_b` agree). The force of a torsion spring in space is that of the angle within
+    half a turn.
     """
 
     value: Array
@@ -54,10 +55,8 @@ def readout(
     multipliers: Float[Array, "... 1"] | None,
     args: Parameters,
 ) -> Readout:
-    """Of every state along the leading axes; angles in space within half a turn.
-
-    `multipliers` are those of this part, if they are known.
-    """
+    """The readout of every state along the leading axes; angles in space are within half a
+    turn. `multipliers` are those of this part, if they are known."""
 
     def of_state(q: Array, v: Array, t: Scalar) -> Readout:
         view = Moving(layout, q, v, args)
@@ -67,7 +66,7 @@ def readout(
         if isinstance(group.law, AbstractPush):
             numbers = at_time(group, numbers, t, args, view)
             force = pushes(group, numbers, view, rate[None])[0]
-        elif isinstance(group.law, AbstractStored):
+        elif isinstance(group.law, AbstractElastic):
             own = {key: x[0] for key, x in numbers.items()}
             force = -jax.grad(group.law.energy)(value, own)
         return Readout(value, rate, force)
@@ -77,7 +76,7 @@ def readout(
     if multipliers is None or not isinstance(law, Driven | Length):
         return found
     along = multipliers if found.value.ndim == q.ndim else multipliers[..., 0]
-    # The rows of a drive have slope one, those of a rod are squares.
+    # The row of a drive has slope one; that of a rod is a difference of squared lengths.
     slope = 2 * found.value if isinstance(law, Length) else 1.0
     return found._replace(force=-slope * along)
 
@@ -90,7 +89,7 @@ def measured_along(
     t: Real,
     args: Parameters,
 ) -> Readout:
-    """Along a run, over any number of turns; of a start, an equilibrium or a state."""
+    """The readout of a run, with full turns of angles, or of a start or another state."""
     measure = measure_of(layout, name)
     if isinstance(sol, State):
         state, times, turns = sol, t, False
@@ -99,19 +98,19 @@ def measured_along(
     else:
         state, times, turns = sol.ys, sol.ts, isinstance(measure, Turn)
     times = jnp.asarray(times, state.q.dtype)
-    held = None
+    multipliers = None
     if name in rows and not isinstance(sol, State):
-        held = sol.multipliers[..., rows[name]]
-    lanes = jnp.broadcast_to(times, state.q.shape[:-1])
-    found = readout(layout, name, state.q, state.v, lanes, held, args)
+        multipliers = sol.multipliers[..., rows[name]]
+    ts = jnp.broadcast_to(times, state.q.shape[:-1])
+    found = readout(layout, name, state.q, state.v, ts, multipliers, args)
     return _over_turns(found, times) if turns else found
 
 
 def _over_turns(found: Readout, times: Float[Array, "... times"]) -> Readout:
-    """An angle in space, as it goes on from the first row.
+    """The readout with an angle in space that is continuous from the first row on.
 
-    What the rates say of the next row tells the number of turns between them: a row may
-    be many turns from the one before.
+    The rates predict the change from row to row, and thereby the number of full turns,
+    even if there are many.
     """
     mean = 0.5 * (found.rate[..., 1:] + found.rate[..., :-1])
     jump = jnp.diff(found.value) - mean * jnp.diff(times)

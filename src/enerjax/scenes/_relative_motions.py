@@ -1,4 +1,4 @@
-"""Small motions of the second body of a joint: gaps and reactions are measured by them."""
+"""Small motions of the second body of a joint, by which gaps and reactions are defined."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,10 +16,10 @@ from ._view import View
 
 
 class Reaction(NamedTuple):
-    """What a joint does to its second body, in space, at each saved time.
+    """The force and torque of a joint on its second body, in space, at each saved time.
 
-    - `force`: shape `(times, d)`; of one state `(d,)`.
-    - `torque`: about the joint's point on that body, `(times, 3)`, in the plane
+    - `force`: shape `(times, d)`; for one state `(d,)`.
+    - `torque`: about the joint's point on that body, shape `(times, 3)`, in the plane
       `(times, 1)`.
     """
 
@@ -39,12 +39,12 @@ def moved(frame: Frame, pivot: Point, shift: Point, turn: Array) -> Frame:
 
 
 def pivot_of(frame: Frame, numbers: Numbers) -> Point:
-    """The point of the second body that a joint holds; its origin, of an angle."""
+    """The joint's point on the second body; for an angle, the origin of this body."""
     return frame.point(numbers["point_b"]) if "point_b" in numbers else frame.origin
 
 
-def still(dimension: int, dtype: Any) -> tuple[Array, Array]:
-    """No translation and no rotation."""
+def no_motion(dimension: int, dtype: Any) -> tuple[Array, Array]:
+    """A translation and a rotation of zero."""
     return jnp.zeros((dimension,), dtype), jnp.zeros((2 * dimension - 3,), dtype)
 
 
@@ -56,7 +56,7 @@ def reaction(
     ends: tuple[str, str],
     args: Parameters,
 ) -> Reaction:
-    """Of a joint or drive between two bodies, in one state."""
+    """The reaction of a joint or drive between two bodies, in one state."""
     group, numbers = _link(layout, joint, args)
     a, b = (View(layout, q).frame(body) for body in ends)
     pivot = pivot_of(b, numbers)
@@ -64,11 +64,11 @@ def reaction(
     def work(shift: Point, turn: Array) -> Scalar:
         return -jnp.sum(multipliers * group.law(a, moved(b, pivot, shift, turn), numbers))
 
-    return Reaction(*jax.grad(work, argnums=(0, 1))(*still(pivot.size, pivot.dtype)))
+    return Reaction(*jax.grad(work, argnums=(0, 1))(*no_motion(pivot.size, pivot.dtype)))
 
 
 def _link(layout: Layout, name: str, args: Parameters) -> tuple[Links, Numbers]:
-    """What a joint or drive holds, and its numbers."""
+    """A joint or drive with the law of its rows, and its numbers."""
     places = layout.places
     if name in places["joints"]:
         number, _ = places["joints"][name]
@@ -76,12 +76,12 @@ def _link(layout: Layout, name: str, args: Parameters) -> tuple[Links, Numbers]:
     number, _ = places["drives"][name]
     group = layout.drive_groups[number]
     assert isinstance(group.law, Driven)
-    # What it prescribes has the slope of its measure.
+    # The rows of a drive have the derivatives of its measure.
     return group._replace(law=group.law.measure), args["drives"][name]
 
 
 def each(function: Callable, q: Array, *others: Array) -> Any:
-    """A function of one state, for all along the leading axes."""
+    """The values of a function of one state for all states along the leading axes."""
     for _ in range(q.ndim - 1):
         function = jax.vmap(function)
     return function(q, *others)

@@ -1,4 +1,4 @@
-"""Rotations and inertias as users write them."""
+"""Checks and conversions of users' rotations and inertias."""
 
 from typing import Any
 
@@ -10,8 +10,7 @@ from ._frames import Numbers
 
 
 def mass_and_inertia(name: str, mass: Any, inertia: Any, *, may_be_flat: bool) -> Numbers:
-    """The inertia as a matrix `(3, 3)`, of principal moments or a matrix that a body can
-    have."""
+    """The checked mass and inertia of a body, the latter as a matrix `(3, 3)`."""
     mass = positive(f"'{name}'", "`mass`", mass)
     matrix = number(f"'{name}'", "`inertia`", inertia, (3,), (3, 3))
     if matrix.ndim == 1:
@@ -34,27 +33,26 @@ def _check_inertia(name: str, matrix: np.ndarray, may_be_flat: bool) -> None:
         )
     if thinnest <= 1e-9 * size and not may_be_flat:
         raise ValueError(
-            f"'{name}' is flat: principal moments {moments.tolist()}, the largest the sum "
-            "of the others. An axis without extent has no inertia of its own, which a "
-            "`RigidBody` needs: give it a thickness, or make it a `QuaternionBody`."
+            f"'{name}' is flat: of its principal moments {moments.tolist()} the largest is "
+            "the sum of the others. A `RigidBody` needs mass along each of its axes: give "
+            "it a thickness, or use a `QuaternionBody`."
         )
 
 
 def rotation_matrix(name: str, rotation: Any) -> Any:
-    """The rotation matrix of a quaternion or matrix, body axes along its columns."""
+    """The rotation matrix of a quaternion or matrix, with body axes along its columns."""
     if rotation is None:
         return np.eye(3)
-    given = number(f"'{name}'", "`rotation`", rotation, (4,), (3, 3))
-    if is_known(given):
-        product = given @ given - 1 if given.ndim == 1 else given @ given.T - np.eye(3)
-        mirrored = given.ndim == 2 and np.linalg.det(given) < 0
-        if np.max(np.abs(product)) > 1e-6 or mirrored:
+    x = number(f"'{name}'", "`rotation`", rotation, (4,), (3, 3))
+    if is_known(x):
+        defect = x @ x - 1 if x.ndim == 1 else x @ x.T - np.eye(3)
+        mirrored = x.ndim == 2 and np.linalg.det(x) < 0
+        if np.max(np.abs(defect)) > 1e-6 or mirrored:
             raise ValueError(
                 f"`rotation` of '{name}' is no rotation: give a unit quaternion (scalar "
-                "first) or an orthogonal matrix of determinant 1, got "
-                f"{given.tolist()}."
+                f"first) or an orthogonal matrix of determinant 1, got {x.tolist()}."
             )
-    return given if given.ndim == 2 else _matrix_of(given)
+    return x if x.ndim == 2 else _matrix_of(x)
 
 
 def _matrix_of(p: Any) -> Any:
@@ -69,7 +67,7 @@ def quaternion_of(matrix: Any) -> Any:
     xp = module_of(matrix)
     m, trace = matrix, xp.trace(matrix)
     turn = xp.stack([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
-    # Four times p p^T: its largest column is the one without cancellation.
+    # This is 4 p p^T, of which the column with the largest diagonal has no cancellation.
     first = xp.concatenate([(1 + trace)[None], turn])
     others = xp.concatenate([turn[:, None], m + m.T + (1 - trace) * np.eye(3)], axis=1)
     products = xp.concatenate([first[None], others])

@@ -1,4 +1,4 @@
-"""What a start must have: joints almost closed, smooth motions, velocities that fit."""
+"""The start of a scene, and checks of its gaps, drives and velocities."""
 
 from typing import NamedTuple
 
@@ -21,12 +21,13 @@ from ._parameters import Parameters
 from ._view import evaluate, lift, View
 
 
-# What is further off than this part of its bodies, or of their speed, is a mistake.
-_FAR = 0.05
+# A gap that is larger than this fraction of the bodies, or of their speed, is a mistake;
+# smaller ones are closed.
+_MISTAKE = 0.05
 
 
 def gaps_of(layout: Layout, state: State, t: Real, args: Parameters) -> dict[str, Measured]:
-    """How far each joint, constraint and drive is from closed."""
+    """The gap of each joint, constraint and drive."""
     q, rates = state.q, lift(layout, state.q, state.v)
     return by_name(layout, measured(layout, q, rates, jnp.asarray(t, q.dtype), args))
 
@@ -34,81 +35,85 @@ def gaps_of(layout: Layout, state: State, t: Real, args: Parameters) -> dict[str
 def check_poses(
     found: dict[str, Measured], ends: dict[str, tuple[str, str]], t: Real
 ) -> None:
-    """Raises for joints that are not almost closed."""
+    """Raises an error for a joint that is far from closed."""
     for name, gap in found.items():
         if not np.isfinite([gap.position, gap.velocity]).all():
             raise ValueError(
-                f"What '{name}' prescribes has no finite value and rate at the start, "
-                f"t = {t}: its function must be smooth there."
+                f"The function of '{name}' has no finite value and rate at the start, "
+                f"t = {t}: it must be smooth there."
             )
-        if name in ends and gap.position > _FAR * gap.size:
+        if name in ends and gap.position > _MISTAKE * gap.size:
             a, b = ends[name]
             raise ValueError(
                 f"'{name}' is off by {gap.position:.3g} at the start, of bodies of size "
                 f"{gap.size:.3g}: the poses of '{a}' and '{b}' do not fit its points, "
-                "axes, length or motion. Points and axes are told in the frames of the "
-                "bodies, whose origin is the mass centre."
+                "axes, length or motion. Points and axes are in the frames of the bodies, "
+                "whose origin is the mass centre."
             )
 
 
-class Told(NamedTuple):
-    """A start as the parts tell it: velocities that are not `given` are zero."""
+class PartialStart(NamedTuple):
+    """A start of which only the velocities with the indices `prescribed` are known.
+
+    The others are zero in `state`.
+    """
 
     state: State
-    given: tuple[int, ...]
+    prescribed: tuple[int, ...]
 
 
 def closed_start(
     layout: Layout,
     system: System,
-    told: Told,
+    partial: PartialStart,
     t: Real,
     args: Parameters,
     rows: dict[str, slice],
 ) -> State:
-    """The state nearest to what is told with all joints closed; see `Scene.start`."""
-    known = is_known((told.state, t, args))
+    """The nearest state with all joints closed; see `Scene.start`."""
+    guess, prescribed = partial
+    known = is_known((guess, t, args))
     if layout.drives and known:
-        check_poses(gaps_of(layout, told.state, t, args), {}, t)
-    # Where all velocities are told the nearest are those with the least change.
-    partly = told.given if len(told.given) < told.state.v.size else ()
+        check_poses(gaps_of(layout, guess, t, args), {}, t)
+    # If all velocities are prescribed they all change, by as little as possible.
+    kept = prescribed if len(prescribed) < guess.v.size else ()
     try:
-        start = start_near(system, told.state, args, t, partly)
+        start = start_near(system, guess, args, t, kept)
     except ValueError as error:
-        name = first_dependent(layout, told.state.q, t, args, rows) if known else None
+        name = first_dependent(layout, guess.q, t, args, rows) if known else None
         if name is None:
             raise
         message = str(error).replace("`System(", "`Scene(")
         raise ValueError(
-            f"{message} In this scene '{name}' repeats what other joints hold already."
+            f"{message} In this scene '{name}' repeats constraints of other joints."
         ) from None
     if known and is_known(start):
-        _check_velocities(layout, told, start, t, args)
+        _check_velocities(layout, partial, start, t, args)
     return _check_turns(layout, start, t, args)
 
 
 def _check_velocities(
-    layout: Layout, told: Told, start: State, t: Real, args: Parameters
+    layout: Layout, partial: PartialStart, start: State, t: Real, args: Parameters
 ) -> None:
-    """Raises where velocities that were given are not near to any that joints admit."""
-    numbers = np.array(told.given, int)
-    v = start.v.at[numbers].set(told.state.v[numbers])
+    """Raises an error if the prescribed velocities are far from those that joints admit."""
+    indices = np.array(partial.prescribed, int)
+    v = start.v.at[indices].set(partial.state.v[indices])
     if np.max(np.abs(v - start.v)) <= 1e-6 * np.max(np.abs(v)):
         return
     for name, gap in gaps_of(layout, State(start.q, v), t, args).items():
-        if gap.velocity > _FAR * gap.speed:
+        if gap.velocity > _MISTAKE * gap.speed:
             raise ValueError(
-                f"The velocities that are given do not fit '{name}': it would part at "
+                f"The velocities of the bodies do not fit '{name}': its gap would grow at "
                 f"{gap.velocity:.3g}, with bodies that move at {gap.speed:.3g}. Leave out "
-                "those that follow from the joints. (`initial_state(scene.system, "
+                "the velocities that follow from the joints. (`initial_state(scene.system, "
                 "scene.q, scene.v, scene.args)` finds the nearest that fit.)"
             )
 
 
 def _check_turns(layout: Layout, start: State, t: Real, args: Parameters) -> State:
-    """The start, if no driven angle in space is half a turn away from its value.
+    """The start, with an error if a driven angle in space is half a turn from its value.
 
-    The sines that are held vanish there too.
+    The sine of the difference, which is the constraint, vanishes there too.
     """
     t = jnp.asarray(t, start.q.dtype)
     for group, numbers in drives_at(layout, t, args):
@@ -118,8 +123,8 @@ def _check_turns(layout: Layout, start: State, t: Real, args: Parameters) -> Sta
         error = jnp.abs(evaluate(missed, View(layout, start.q), numbers))[:, 0]
         opposite = jax.lax.stop_gradient(error > np.pi / 2)
         message = (
-            "the pose of the start is nearer to the opposite of what is prescribed: give "
-            "the bodies the angle of their drive."
+            "the start is nearer to the opposite of the prescribed angle: give the bodies "
+            "the angle of their drive."
         )
         if not is_known(opposite):
             start = eqx.error_if(start, opposite, f"{[*group.names]}: {message}")

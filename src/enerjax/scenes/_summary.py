@@ -1,4 +1,4 @@
-"""A scene in words."""
+"""The text that `print(scene)` shows."""
 
 from collections.abc import Callable
 
@@ -13,10 +13,10 @@ def summary(
     may_repeat: bool,
     count: Callable[[], int | None],
 ) -> str:
-    """Bodies, joints, forces and drives with what they are and what they count for.
+    """A list of all parts with their classes, coordinates and constraints.
 
-    `count` finds the degrees of freedom where joints may repeat each other, or do: where
-    as many as there are would leave none.
+    If constraints may be redundant, or must be because they outnumber the velocities,
+    `count` finds the degrees of freedom.
     """
     bodies, joined = dict(layout.bodies), {x for pair in ends.values() for x in pair}
     held = sum(place.stop - place.start for place in rows.values())

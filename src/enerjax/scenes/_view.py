@@ -1,4 +1,4 @@
-"""Where the bodies of a scene are, for given coordinates."""
+"""The positions and orientations of bodies for the coordinates of a scene."""
 
 from functools import cached_property
 
@@ -14,7 +14,7 @@ from ._layout import Layout, Links
 
 
 def rows(x: Array, index: np.ndarray) -> Array:
-    """`x[index]`, without a look-up where the entries follow each other."""
+    """`x[index]`, which is a slice if the indices are consecutive."""
     first = index.flat[0]
     if np.array_equal(index.ravel(), np.arange(first, first + index.size)):
         return x[first : first + index.size].reshape(index.shape + x.shape[1:])
@@ -22,7 +22,7 @@ def rows(x: Array, index: np.ndarray) -> Array:
 
 
 class View:
-    """A scene at its coordinates `q`; what is not asked for is not computed.
+    """A scene with the coordinates `q`; quantities are computed when they are needed.
 
     `position(body, point)`, `direction(body, axis)` and `angle(body)` are for potentials
     and constraints of your own; `q` are the coordinates of all bodies.
@@ -75,7 +75,7 @@ class View:
     def _number(self, body: str) -> int:
         if not isinstance(body, str):
             raise TypeError(
-                f"Bodies are told by their names, got a {type(body).__name__}: write "
+                f"Bodies are identified by name, got a {type(body).__name__}: write "
                 f"'{getattr(body, 'name', '...')}'."
             )
         try:
@@ -86,7 +86,7 @@ class View:
             ) from None
 
     def position(self, body: str, point: Vector | None = None) -> Point:
-        """A point of a body in space; its mass centre if none is given."""
+        """A point of a body in space; by default its mass centre."""
         k = self._number(body)
         if point is None:
             return self.origins[k]
@@ -99,7 +99,7 @@ class View:
         return Frame(axes=axes).direction(self._vector(body, "axis", axis))
 
     def _vector(self, body: str, role: str, value: Vector) -> Point:
-        """A point or an axis in the frame of a body, which must be one that turns."""
+        """A checked point or axis in the frame of a body that has an orientation."""
         vector, dimension = jnp.asarray(value, self.q.dtype), self.layout.dimension
         if vector.shape != (dimension,):
             raise ValueError(
@@ -128,7 +128,7 @@ class View:
 
 
 def evaluate(group: Links, view: View, numbers: dict[str, Array]) -> Array:
-    """What a law says of all its links, one row each."""
+    """The values of a law for all its links, one row each."""
     a, b = (view.frames(bodies, group.law.reads) for bodies in (group.a, group.b))
     return jax.vmap(group.law)(a, b, numbers)
 

@@ -1,8 +1,8 @@
-"""Bodies: what has mass.
+"""Bodies.
 
-The origin of a body frame is the mass centre. Poses and velocities are told in space, at
-the start; points, axes and inertias in the frame of the body. Velocities that are left out
-follow from those that are given, by the joints.
+The origin of a body frame is the mass centre. Poses and velocities are those of the start,
+in space; points, axes and inertias are in the frame of the body. Velocities that are left
+out follow from the others and the joints.
 """
 
 import abc
@@ -20,23 +20,23 @@ from ._body_coordinates import (
     QuaternionBodies,
 )
 from ._frames import Numbers
-from ._names import only_parts
+from ._part import only_parts
 from ._rotations import mass_and_inertia, quaternion_of, rotation_matrix
 
 
 class AbstractBody(eqx.Module):
-    """A body of a scene: a name, its numbers and its start.
+    """A body of a scene.
 
-    - `numbers`: mass and inertia, as they stand in `args["bodies"][name]`.
+    - `numbers`: mass and inertia, the entries of `args["bodies"][name]`.
     - `q`, `v`: its coordinates and velocities at the start.
-    - `given`: which velocities are told; the others are zeros.
+    - `prescribed`: which velocities the user has passed; the others are zeros.
     """
 
     name: str
     numbers: Numbers
     q: Any
     v: Any
-    given: tuple[bool, ...]
+    prescribed: tuple[bool, ...]
 
     @property
     @abc.abstractmethod
@@ -63,7 +63,7 @@ class PointMass(AbstractBody):
         self.name = name
         self.numbers = dict(mass=positive(f"'{name}'", "`mass`", mass))
         self.q = number(f"'{name}'", "`position`", position, (2,), (3,))
-        self.v, self.given = velocities(f"'{name}'", (velocity, self.q.shape))
+        self.v, self.prescribed = velocities(f"'{name}'", (velocity, self.q.shape))
 
     @property
     def kind(self) -> AbstractBodyCoordinates:
@@ -103,9 +103,7 @@ class PlanarBody(AbstractBody):
         )
         place = number(part, "`position`", position, (2,))
         self.q = joined(place, number(part, "`angle`", angle, ()))
-        self.v, self.given = velocities(
-            f"'{name}'", (velocity, (2,)), (angular_velocity, ())
-        )
+        self.v, self.prescribed = velocities(part, (velocity, (2,)), (angular_velocity, ()))
 
     @property
     def kind(self) -> AbstractBodyCoordinates:
@@ -141,7 +139,7 @@ class PlanarBody(AbstractBody):
 
 
 class RigidBody(AbstractBody):
-    """A rigid body in space, in directors: the one to take first.
+    """A rigid body in space, with directors as coordinates: the recommended kind.
 
     **Arguments:**
 
@@ -151,17 +149,17 @@ class RigidBody(AbstractBody):
       or a matrix `(3, 3)` (mass length^2).
     - `position`, `velocity`: of the mass centre at the start, three entries each.
     - `rotation`: at the start, a unit quaternion (scalar first) or a matrix `(3, 3)` with
-      the body axes in space along its columns; parallel to space where not given.
+      the body axes in space along its columns; the identity by default.
     - `angular_velocity`: at the start, in space (angle per time).
 
-    Twelve coordinates, the mass centre and the body axes as vectors in space, and six
-    constraints of their own. Inertia is constant and points are linear in the
-    coordinates, so that `EnergyPreserving` keeps momenta to round-off, and the equations
-    of many bodies stay sparse.
+    The body has twelve coordinates, the mass centre and the body axes as vectors in space,
+    and six internal constraints. The inertia is constant and points are linear in the
+    coordinates, so that `EnergyPreserving` conserves momenta to round-off, and the
+    equations of many bodies are sparse.
 
     **Raises:** `ValueError` for moments of inertia that no body has, and for those of a
-    flat body or a thin rod: with no mass across, an axis would have no inertia of its own.
-    Give such a body its thickness, or take `QuaternionBody`.
+    flat body or a thin rod, which have no mass along one axis. Give such a body a
+    thickness, or use `QuaternionBody`.
     """
 
     def __init__(
@@ -177,12 +175,11 @@ class RigidBody(AbstractBody):
     ):
         self.name = name
         self.numbers = mass_and_inertia(name, mass, inertia, may_be_flat=False)
-        place = number(f"'{name}'", "`position`", position, (3,))
         axes = rotation_matrix(name, rotation).T
-        self.q = joined(place, axes)
-        v, given = velocities(f"'{name}'", (velocity, (3,)), (angular_velocity, (3,)))
+        self.q = joined(number(f"'{name}'", "`position`", position, (3,)), axes)
+        v, flags = velocities(f"'{name}'", (velocity, (3,)), (angular_velocity, (3,)))
         self.v = joined(v[:3], module_of(v, axes).cross(v[None, 3:], axes))
-        self.given = (*given[:3], *given[3:] * 3)
+        self.prescribed = (*flags[:3], *flags[3:] * 3)
 
     @property
     def kind(self) -> AbstractBodyCoordinates:
@@ -190,12 +187,13 @@ class RigidBody(AbstractBody):
 
 
 class QuaternionBody(AbstractBody):
-    """A rigid body in space, in Euler parameters.
+    """A rigid body in space, with Euler parameters as coordinates.
 
-    Arguments as for `RigidBody`. Seven coordinates, the mass centre and a unit quaternion
-    (scalar first); velocities are those of the mass centre and the angular velocity in
-    body axes. For flat bodies, which `RigidBody` refuses. Angular momentum is kept to
-    second order, steps are solved densely, and `EnergyConsistent` needs `RigidBody`.
+    It can be flat, which a `RigidBody` cannot; the arguments are the same. It has seven
+    coordinates, the mass centre and a unit quaternion (scalar first); its velocities are
+    that of the mass centre and the angular velocity in body axes. Angular momentum is
+    conserved to second order only, the step equations are dense, and `EnergyConsistent`
+    cannot be used.
     """
 
     def __init__(
@@ -211,10 +209,10 @@ class QuaternionBody(AbstractBody):
     ):
         self.name = name
         self.numbers = mass_and_inertia(name, mass, inertia, may_be_flat=True)
-        place = number(f"'{name}'", "`position`", position, (3,))
-        matrix = rotation_matrix(name, rotation)
-        self.q = joined(place, quaternion_of(matrix))
-        v, self.given = velocities(f"'{name}'", (velocity, (3,)), (angular_velocity, (3,)))
+        matrix, part = rotation_matrix(name, rotation), f"'{name}'"
+        position = number(part, "`position`", position, (3,))
+        self.q = joined(position, quaternion_of(matrix))
+        v, self.prescribed = velocities(part, (velocity, (3,)), (angular_velocity, (3,)))
         self.v = joined(v[:3], v[3:] @ matrix)
 
     @property

@@ -1,9 +1,9 @@
-"""Drives: what is moved on a schedule.
+"""Drives, which prescribe a motion.
 
 Each takes a `motion(t, args)`, a smooth function of the time and of the `args` of the
-system; its velocity and acceleration are derived. Points and axes are told as for joints.
-A scene starts at `t = 0`, with the velocities that its drives prescribe there. What a drive
-takes, force or torque, is its `scene.reaction`, and its power is in `sol.audit.drive_work`.
+system; its velocity and acceleration are derived. Points and axes are passed as for joints.
+A scene starts at `t = 0`, with the velocities that its drives prescribe there. The force or
+torque of a drive is its `scene.reaction`, and its work is in `sol.audit.drive_work`.
 """
 
 import equinox as eqx
@@ -13,8 +13,7 @@ from ._ends import Ends
 from ._frames import GROUND, Numbers
 from ._laws import Driven, Signal
 from ._measures import AbstractLaw, Place, Separation, Slide, turn_of
-from ._names import only_parts
-from ._part import AbstractPart
+from ._part import AbstractPart, only_parts
 from ._user_functions import check_function
 
 
@@ -28,11 +27,11 @@ class AbstractDrive(AbstractPart):
 
 
 class Angle(AbstractDrive):
-    """Prescribes the angle of the second body against the first: a motor that turns.
+    """Prescribes the angle of the second body relative to the first, as a motor does.
 
-    In the plane the difference of their angles. In space the turn from the start pose
-    about `axis`, told in the first body, which revolute or cylindrical joints must keep
-    common to both bodies; over any number of turns.
+    In the plane this is the difference of their angles. In space it is the rotation from
+    the start pose about `axis`, in the frame of the first body; revolute or cylindrical
+    joints must keep this axis common to both bodies. The angle may exceed a full turn.
     """
 
     motion: Signal
@@ -44,9 +43,9 @@ class Angle(AbstractDrive):
 
 
 class Displacement(AbstractDrive):
-    """Prescribes how far the second point is from the first, along an axis of body `a`.
+    """Prescribes the displacement of the second point from the first along an axis of `a`.
 
-    Points that are not given are the origins of the frames.
+    Points default to the origins of the frames.
     """
 
     motion: Signal
@@ -60,9 +59,9 @@ class Displacement(AbstractDrive):
 
 
 class Distance(AbstractDrive):
-    """Prescribes the distance of two points, which must stay positive: a hydraulic ram.
+    """Prescribes the distance of two points, as a hydraulic cylinder does.
 
-    Points that are not given are the origins of the frames.
+    The distance must stay positive. Points default to the origins of the frames.
     """
 
     motion: Signal
@@ -70,32 +69,25 @@ class Distance(AbstractDrive):
     point_b: Vector | None = None
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
-        numbers, _ = ends.apart(self.point_a, self.point_b)
+        numbers, _ = ends.separate_points(self.point_a, self.point_b)
         return Driven(Separation(), self.motion), numbers
 
 
 class Position(AbstractDrive):
-    """Leads a point of a `body` along a path in space; `motion` returns the position.
+    """Moves a point of a `body` along a path in space; `motion` returns the position.
 
-    The point is the mass centre if it is not given.
+    The point defaults to the mass centre.
     """
 
     motion: Signal
     point: Vector | None
 
-    def __init__(
-        self,
-        name: str,
-        body: str,
-        motion: Signal,
-        point: Vector | None = None,
-    ):
+    def __init__(self, name: str, body: str, motion: Signal, point: Vector | None = None):
         self.name, self.a, self.b = name, GROUND, body
         self.motion, self.point = motion, point
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
-        point = ends.origins(None, self.point)["point_b"]
-        return Driven(Place(), self.motion), dict(point_b=point)
+        return Driven(Place(), self.motion), ends.point_of_body(self.point)
 
 
 __dir__ = only_parts(globals())

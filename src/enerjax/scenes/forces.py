@@ -1,8 +1,7 @@
-"""Forces. Points are told as for joints, in the frames of the bodies.
+"""Forces. Points are passed as for joints, in the frames of the bodies.
 
-Springs and constant forces have a potential. Dampers, actuators and loads have none: what
-they bring in is in `sol.audit.work`, and their functions are those of the time and of the
-`args` of the system.
+Springs and constant forces have a potential. Dampers, actuators and loads have none: their
+work is in `sol.audit.work`. Functions depend on the time and the `args` of the system.
 """
 
 from .._types import Real, Vector
@@ -19,15 +18,19 @@ from ._loads import (
     TorsionDamper as TorsionDamper,
 )
 from ._measures import AbstractLaw, Place, PlanarTurn, Separation, Turn
-from ._names import only_parts
-from ._part import AbstractForce as AbstractForce, AbstractFunctionOfPose, PoseFunction
+from ._part import (
+    AbstractForce as AbstractForce,
+    AbstractFunctionOfPose,
+    only_parts,
+    PoseFunction,
+)
 
 
 class Spring(AbstractForce):
     """A linear spring between two points, `stiffness (r - length)^2 / 2`.
 
-    Points that are not given are the origins of the frames; a `length` that is not given
-    is that of the start. The points must not meet, where the direction is undefined.
+    Points default to the origins of the frames, and `length` to their distance at the
+    start. The points must never coincide, because the direction is undefined then.
     """
 
     stiffness: Real
@@ -36,7 +39,7 @@ class Spring(AbstractForce):
     point_b: Vector | None = None
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
-        numbers, start = ends.apart(self.point_a, self.point_b)
+        numbers, start = ends.separate_points(self.point_a, self.point_b)
         length = start if self.length is None else self.length
         return Elastic(Separation(), "length"), numbers | dict(
             stiffness=number(ends.part, "`stiffness`", self.stiffness, ()),
@@ -47,11 +50,11 @@ class Spring(AbstractForce):
 class TorsionSpring(AbstractForce):
     """A linear spring between the angles of two bodies, `stiffness (turn - angle)^2 / 2`.
 
-    In the plane `turn` is the difference of the angles, over any number of turns, and an
-    `angle` that is not given is that of the start. In space `turn` is counted from the
-    start about `axis`, told in the first body, and `angle` is zero if it is not given;
-    revolute or cylindrical joints must keep this axis common to both bodies. The energy
-    jumps at half a turn there: keep away from it.
+    In the plane `turn` is the difference of the angles, which may exceed a full turn, and
+    `angle` defaults to that of the start. In space `turn` is the rotation from the start
+    pose about `axis`, in the frame of the first body, and `angle` defaults to zero;
+    revolute or cylindrical joints must keep this axis common to both bodies. There the
+    energy jumps at half a turn, which the motion must not reach.
     """
 
     stiffness: Real
@@ -63,18 +66,18 @@ class TorsionSpring(AbstractForce):
         if ends.dimension == 2:
             ends.refuse_axes(self.axis)
             ends.only_bodies_that_turn()
-            law, start = Elastic(PlanarTurn(), "angle"), ends.turn()
+            law, start = Elastic(PlanarTurn(), "angle"), ends.relative_angle()
         else:
             law, start = Elastic(Turn(), "angle"), 0.0
-            numbers |= ends.about(self.axis)
+            numbers |= ends.common_axis(self.axis)
         angle = start if self.angle is None else self.angle
         return law, numbers | dict(angle=number(ends.part, "`angle`", angle, ()))
 
 
 class ConstantForce(AbstractForce):
-    """A force on a point of a `body` that keeps its direction in space.
+    """A force on a point of a `body` that is constant in space.
 
-    `force` has two or three entries; `point` is the mass centre if it is not given.
+    `force` has two or three entries; `point` defaults to the mass centre.
     """
 
     force: Vector
@@ -86,8 +89,7 @@ class ConstantForce(AbstractForce):
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         force = number(ends.part, "`force`", self.force, (ends.dimension,))
-        point = ends.origins(None, self.point)["point_b"]
-        return Steady(Place(), "force"), dict(force=force, point_b=point)
+        return Steady(Place(), "force"), dict(force=force) | ends.point_of_body(self.point)
 
 
 class ConstantTorque(AbstractForce):
@@ -112,8 +114,8 @@ class ConstantTorque(AbstractForce):
 class Potential(AbstractFunctionOfPose):
     """A potential of your own: `function(view, args)`, a scalar (energy).
 
-    `view` tells where the bodies are: `view.position(body, point)`,
-    `view.direction(body, axis)`, `view.angle(body)` and `view.q`, the coordinates.
+    `view` describes the pose: `view.position(body, point)`, `view.direction(body, axis)`,
+    `view.angle(body)`, and the coordinates `view.q`.
     """
 
     name: str

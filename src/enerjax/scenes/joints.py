@@ -1,14 +1,14 @@
-"""Joints: what constrains two bodies, or a body and the `"ground"`.
+"""Joints: constraints between two bodies, or a body and the `"ground"`.
 
-Points and axes are told in the frames of their bodies; those of the ground are in space. Of
-two points, one that is not given is where the other one is in the start pose; if neither is
-given they are the origins of the frames. Axes that are not given for the second body follow
-from the start pose too. So `Revolute("pin", "ground", "crank", [0.3, 0])` is a pin through
-the crank, where the crank starts.
+Points and axes are in the frames of their bodies; those of the ground are in space. If one
+of the two points is left out, it coincides with the other in the start pose; if both are,
+they are the origins of the frames. The axis in the second body follows from the start pose
+too. So `Revolute("pin", "ground", "crank", [0.3, 0])` is a pin at `[0.3, 0]`, through the
+point of the crank that is there at the start.
 
-`args["joints"][name]` holds `point_a`, `point_b` and, for joints with axes, the axes of the
-joint in either body, `frame_a` and `frame_b`, as rows (the axis comes last in space, first
-in the plane).
+`args["joints"][name]` contains `point_a`, `point_b` and, for joints with axes, the axes of
+the joint in both bodies, `frame_a` and `frame_b`, as rows (the axis itself is the last of
+them in space, and the first in the plane).
 """
 
 from collections.abc import Callable
@@ -24,8 +24,7 @@ from ._ends import Ends
 from ._frames import Numbers
 from ._laws import Alignment, Curve, Length
 from ._measures import AbstractLaw
-from ._names import only_parts
-from ._part import AbstractFunctionOfPose, AbstractPart, PoseFunction
+from ._part import AbstractFunctionOfPose, AbstractPart, only_parts, PoseFunction
 from ._user_functions import check_function, vector_of
 
 
@@ -60,8 +59,8 @@ class Spherical(AbstractPointJoint):
 class Revolute(AbstractAxisJoint):
     """Holds two points together, and in space an axis: a pin or hinge.
 
-    Two constraints in the plane, where there is no `axis` to give, five in space. `axis`
-    is told in the first body, `axis_b` in the second.
+    Two constraints in the plane, where it takes no `axis`, five in space. `axis` is in the
+    frame of the first body, `axis_b` in that of the second.
     """
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
@@ -86,7 +85,7 @@ class Universal(AbstractAxisJoint):
 
 
 class Prismatic(AbstractPointJoint):
-    """Lets a body slide along an axis of the first body, and turn about none.
+    """Lets a body slide along an axis of the first body, without turning.
 
     Two constraints in the plane, five in space.
     """
@@ -114,7 +113,7 @@ class Cylindrical(AbstractAxisJoint):
 
 
 class Planar(AbstractAxisJoint):
-    """Lets a body slide and turn in the plane of the first body that `axis` is normal to.
+    """Lets a body slide and turn in a plane of the first body, to which `axis` is normal.
 
     Three constraints, in space.
     """
@@ -140,27 +139,27 @@ class Fixed(AbstractPointJoint):
 
 
 class Distance(AbstractPointJoint):
-    """Holds two points at a distance: a rod without mass. One constraint.
+    """Keeps the distance of two points: a rod without mass. One constraint.
 
-    Points that are not given are the origins of the frames, a `length` (positive) that is
-    not given is that of the start. The points must not meet.
+    Points default to the origins of the frames, and the `length` (positive) to their
+    distance at the start. The points must not coincide.
     """
 
     length: Real | None = None
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
-        numbers, start = ends.apart(self.point_a, self.point_b)
+        numbers, start = ends.separate_points(self.point_a, self.point_b)
         length = start if self.length is None else self.length
         return Length(), numbers | dict(length=positive(ends.part, "`length`", length))
 
 
 class OnCurve(AbstractJoint):
-    """Holds a point of the second body on a curve or surface in the first.
+    """Keeps a point of the second body on a curve or surface of the first.
 
     `curve(x, numbers)` is a vector of smooth functions of a point `x` in the frame of the
     first body, shape `(2,)` or `(3,)`, that vanish on the curve: one entry for a curve in
-    the plane or a surface in space, two for a curve in space. `numbers` is the dictionary
-    of floats given here, found again in `args["joints"][name]`.
+    the plane or a surface in space, two for a curve in space. `numbers` is a dictionary of
+    floats, which are also entries of `args["joints"][name]`.
     """
 
     curve: Callable[[Array, Numbers], Array]
@@ -175,17 +174,16 @@ class OnCurve(AbstractJoint):
             key: module_of(value).asarray(value) * 1.0
             for key, value in self.numbers.items()
         }
-        point = ends.origins(None, self.point_b)["point_b"]
         x = jnp.zeros((ends.dimension,))
         jax.eval_shape(lambda x: vector_of(self.name, self.curve, x, own), x)
-        return Curve(self.curve), own | dict(point_b=point)
+        return Curve(self.curve), own | ends.point_of_body(self.point_b)
 
 
 class Constraint(AbstractFunctionOfPose):
     """A constraint of your own: `function(view, args)`, a vector that vanishes.
 
-    `view` tells where the bodies are: `view.position(body, point)`,
-    `view.direction(body, axis)`, `view.angle(body)` and `view.q`, the coordinates.
+    `view` describes the pose: `view.position(body, point)`, `view.direction(body, axis)`,
+    `view.angle(body)`, and the coordinates `view.q`.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""A scene: bodies, joints, forces and drives, and the system that they make."""
+"""A scene: bodies, joints, forces and drives, and the system that they form."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -20,7 +20,7 @@ from ._gaps import Gap, Measured
 from ._parameters import Parameters
 from ._readouts import measured_along, Readout
 from ._relative_motions import each, Reaction, reaction
-from ._start import check_poses, closed_start, gaps_of, Told
+from ._start import check_poses, closed_start, gaps_of, PartialStart
 from ._summary import summary
 from ._view import View
 from .bodies import AbstractBody
@@ -30,7 +30,7 @@ from .joints import AbstractJoint
 
 
 class Scene:
-    """Bodies, joints, forces and drives under names, compiled to a `System`.
+    """Named bodies, joints, forces and drives, which are compiled to a `System`.
 
         scene = ej.Scene(
             [
@@ -47,22 +47,21 @@ class Scene:
 
     **Arguments:**
 
-    - `parts`: bodies, joints, forces and drives in any order, each with a name of its own;
-      the name `"ground"` is taken. Coordinates stand body by body in this order.
-    - `gravity`: the acceleration in space, two or three entries; none if not given.
-    - `args`: numbers of your own, for functions of yours, found again under their names
-      in the `args` of the system.
-    - `redundant`: whether joints may repeat what others hold; see `System`.
+    - `parts`: bodies, joints, forces and drives in any order, with unique names; the name
+      `"ground"` is reserved. The order of the bodies is that of their coordinates.
+    - `gravity`: the acceleration in space, two or three entries; none by default.
+    - `args`: numbers for your own functions, which find them by name in the `args` of the
+      system.
+    - `redundant`: whether joints may be redundant; see `System`.
 
-    A scene does not change. `system` is what `simulate` takes, `args` its `Parameters`, `q`
-    and `v` the start as the parts tell it. Parts of a kind are evaluated together, so the
-    size of the program depends on the kinds in use and not on the number of parts; two
-    scenes that differ in numbers alone share their programs.
+    A scene is immutable. `system` is passed to `simulate`, `args` are its `Parameters`, and
+    `q` and `v` are the start before joints are closed. Parts of a kind are evaluated
+    together, so the size of the program does not depend on the number of parts; scenes that
+    differ only in numbers share their programs.
 
     **Raises:** `ValueError` or `TypeError` for parts that do not fit together, with their
-    names: unknown or repeated names, masses and inertias that no body has, a joint that is
-    far from closed at the start. A joint that is off by a little, as its bodies measure,
-    is closed by `start`; `report` tells by how much.
+    names: unknown or repeated names, impossible masses and inertias, a joint that is far
+    from closed at the start. A small gap is closed by `start`, and listed by `report`.
     """
 
     system: System
@@ -90,34 +89,34 @@ class Scene:
         self.system = make_system(self._layout, redundant)
         self.q, self.v = (join([getattr(b, x) for b in bodies]) for x in ("q", "v"))
         self._rows = rows_of(self._layout, self.q, self.args)
-        if self.system.force is not None:  # a function of the user's own may not fit
+        if self.system.force is not None:  # checks the users' functions
             t = jnp.zeros((), self.q.dtype)
             jax.eval_shape(self.system.force, self.q, self.v, t, self.args)
-        told = [flag for body in bodies for flag in body.given]
-        self._given = tuple(k for k, flag in enumerate(told) if flag)
+        flags = [flag for body in bodies for flag in body.prescribed]
+        self._prescribed = tuple(k for k, flag in enumerate(flags) if flag)
         if self._rows and is_known((self.q, self.v, self.args)):
             check_poses(self._gaps(None, 0.0, None), self._ends, 0.0)
 
     def build(self) -> tuple[System, State, Parameters]:
-        """`(system, start, args)`, as all functions take them."""
+        """`(system, start, args)`, the first arguments of `simulate`."""
         return self.system, self.start(), self.args
 
     def start(self, args: Parameters | None = None, *, t: Real = 0.0) -> State:
-        """The state nearest to the poses of the parts with all joints closed.
+        """The state nearest to the poses of the bodies in which all joints are closed.
 
-        With other `args` than the scene's own where lengths or points have changed, at
-        another time where drives start elsewhere. Velocities that parts tell are kept, and
-        those that they leave out follow by the joints; what these leave open moves with
-        the least kinetic energy.
+        Pass `args` if lengths or points have changed, and `t` if drives start at another
+        time. The prescribed velocities of bodies are kept. The others follow from the
+        joints; those that joints do not determine are such that the kinetic energy is
+        least.
 
-        **Raises:** as `initial_state`, with the name of the joint that is to blame; where
-        values are known also for velocities that no joint allows, and for drives that are
-        not smooth at `t`. `ValueError` for a pose opposite to a driven angle in space,
-        under `jit`, `vmap` and `grad` `equinox.EquinoxRuntimeError`.
+        **Raises:** as `initial_state`, with the name of the joint. If values are known,
+        also for velocities that joints do not admit, and for drives that are not smooth at
+        `t`. `ValueError` for a pose opposite to a driven angle in space, under `jit`,
+        `vmap` and `grad` `equinox.EquinoxRuntimeError`.
         """
         args = self.args if args is None else args
-        told = Told(State(self.q, self.v), self._given)
-        return closed_start(self._layout, self.system, told, t, args, self._rows)
+        partial = PartialStart(State(self.q, self.v), self._prescribed)
+        return closed_start(self._layout, self.system, partial, t, args, self._rows)
 
     def report(
         self,
@@ -126,11 +125,11 @@ class Scene:
         *,
         t: Real = 0.0,
     ) -> dict[str, Gap]:
-        """How far each joint is from closed, by name: in the start as the parts tell it,
-        or in another state, such as `start()`, at its time `t`.
+        """The gap of each joint by name, in the poses of the bodies, or in another state.
 
-        `position` is a length (an angle counts as an arc of the size of its bodies),
-        `velocity` its rate; velocities that the parts leave out count as zero.
+        `position` is a length (an angle counts as an arc with the size of the bodies as
+        radius), `velocity` its rate. Velocities that are left out count as zero. `t` is the
+        time of the state.
         """
         found = self._gaps(state, t, args)
         return {name: Gap(gap.position, gap.velocity) for name, gap in found.items()}
@@ -142,12 +141,10 @@ class Scene:
         *,
         t: Real = 0.0,
     ) -> Mobility:
-        """The freedoms of the scene in a pose, that of its parts if none is given; see
-        `mobility`.
+        """The degrees of freedom in a pose, by default that of the bodies; see `mobility`.
 
-        Rows are named by their joint, `"hinge[0]"`; those within bodies by their number.
-        Those are redundant that follow from rows before them; first come those within
-        bodies.
+        Rows of constraints are named after their joint, `"hinge[0]"`; internal rows of
+        bodies have numbers, and count before all others.
         """
         state = State(self.q, self.v) if state is None else state
         args = self.args if args is None else args
@@ -157,10 +154,10 @@ class Scene:
         return freedoms(self.system, state, args, t, names, own)
 
     def position(self, ys: State, body: str, point: Vector | None = None) -> Array:
-        """A point of a body in space along a run, shape `(times, d)`; of one state `(d,)`.
+        """A point of a body in space along a run, shape `(times, d)`; for a state `(d,)`.
 
-        `point` is told in the frame of the body; its mass centre if it is not given. A
-        batch of runs has its axes before that of time.
+        `point` is in the frame of the body, by default the mass centre. For a batch of runs
+        the axes of the batch come before that of time.
         """
         return self._along(lambda q, v: View(self._layout, q).position(body, point), ys)
 
@@ -170,7 +167,7 @@ class Scene:
         return self._along(lambda q, v: moving(q, v).velocity(body, point), ys)
 
     def direction(self, ys: State, body: str, axis: Vector) -> Array:
-        """A direction that is fixed in a body, in space; otherwise as `position`."""
+        """A body-fixed direction in space; otherwise as `position`."""
         return self._along(lambda q, v: View(self._layout, q).direction(body, axis), ys)
 
     def angle(self, ys: State, body: str) -> Array:
@@ -185,15 +182,16 @@ class Scene:
         *,
         t: Real = 0.0,
     ) -> Readout:
-        """Length or angle, its rate, and the force of a spring, damper, actuator, load or
-        drive, of a hinge, slider or rod, along a run; also of a start or a state, at `t`.
-        `args` are those of the run, where they are not the scene's own.
+        """The length or angle of a part along a run, its rate, and the force along it.
 
-        Angles of hinges in space count full turns along a run, from within half a turn of
-        the start pose; of a state alone these are not known.
+        Parts are springs, dampers, actuators, loads, drives, hinges, sliders and rods. For
+        a start or a state, `t` is its time. Pass the `args` of the run if they are not
+        those of the scene.
 
-        **Raises:** `ValueError` for a part without a length or angle, with those that have
-        one.
+        Along a run, angles of hinges in space include full turns; for a single state these
+        are not known.
+
+        **Raises:** `ValueError` for a part without a length or angle.
         """
         args = self.args if args is None else args
         return measured_along(self._layout, self._rows, sol, name, t, args)
@@ -204,11 +202,11 @@ class Scene:
         joint: str,
         args: Parameters | None = None,
     ) -> Reaction:
-        """Force and torque of a joint or drive on its second body, along a run, at a start
-        or in an equilibrium.
+        """The force and torque of a joint or drive on its second body, along a run, at a
+        start or in an equilibrium.
 
-        `args` are those of the run, where they are not the scene's own. Multipliers of a
-        run are means over the step that ends at a row, and are taken to act there.
+        Pass the `args` of the run if they are not those of the scene. The multipliers of a
+        run are means over the step that ends at a row, and count as those of the row.
         """
         check_reacting(joint, self._rows, self._ends)
         at_rest = isinstance(sol, ConsistentStart | Equilibrium)
@@ -234,7 +232,7 @@ class Scene:
         try:
             start = self.start() if self.system.redundant else State(self.q, self.v)
             return self.mobility(start).degrees_of_freedom
-        except ValueError:  # of a scene that cannot be closed
+        except ValueError:  # the joints cannot be closed
             return None
 
     def _along(self, function: Any, ys: State) -> Array:
