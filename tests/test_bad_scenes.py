@@ -152,15 +152,15 @@ BAD = {
             DOT,
             ej.drives.Distance("ram", "ground", "dot", lambda t, args: 1 + jnp.sqrt(t)),
         ],
-        "'ram' prescribes has no finite value and rate",
+        "function of 'ram' has no finite value and rate",
     ),
     "spring without length": (
         lambda: [ORIGIN, ej.forces.Spring("spring", "ground", "dot", 3.0, 1.0)],
-        "'spring' acts along the line of two points.* meet",
+        "'spring' acts along the line between two points.* coincide",
     ),
     "rod without length": (
         lambda: [ORIGIN, ej.joints.Distance("tie", "ground", "dot", length=1.0)],
-        "'tie' acts along the line of two points.* meet",
+        "'tie' acts along the line between two points.* coincide",
     ),
     "scalar curve": (
         lambda: [ORIGIN, ej.joints.OnCurve("rail", "ground", "dot", lambda x, n: x[1])],
@@ -186,7 +186,7 @@ BAD = {
             ROD, PIN,
             ej.drives.Angle("motor", "ground", "rod", lambda t, args: args["w"] * t),
         ],
-        "function of 'motor' asks for 'w', which is not there",
+        "function of 'motor' asks for 'w', which does not exist",
     ),
 }  # fmt: skip
 
@@ -228,7 +228,7 @@ def test_what_a_scene_cannot_tell_is_refused():
         (lambda: dot.direction(of(dot), "dot", [1.0, 0.0]), "'dot' is a point mass"),
         (lambda: dot.position(of(dot), "dot", [1.0, 0.0]), "'dot' is a point mass"),
         (lambda: rod.position(of(rod), "rod", [1.0, 0.0, 0.0]), "of 'rod' must be of 2"),
-        (lambda: rod.position(of(rod), no_name), "told by their names.*write 'rod'"),
+        (lambda: rod.position(of(rod), no_name), "identified by name.*write 'rod'"),
     ):
         with pytest.raises((ValueError, TypeError), match=message):
             ask()

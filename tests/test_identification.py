@@ -121,7 +121,7 @@ def test_starts_from_many_guesses():
             {"solver": optx.Newton(1e-8, 1e-8)},
             "`solver` must be a least-squares solver",
         ),
-        (GUESS | {"rate": -1e9}, {}, "not finite where the fit began"),
+        (GUESS | {"rate": -1e9}, {}, "not finite at the guess"),
         (GUESS | {"offset": np.zeros(40)}, {}, "40 numbers for 42 parameters"),
         (GUESS, {"max_steps": 0}, "positive integer"),
         (GUESS | {"a": 1j}, {}, "must hold real numbers"),
