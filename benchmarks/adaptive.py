@@ -1,13 +1,13 @@
-"""Steps of varying length against steps of one length: errors, steps and times.
+"""Adaptive steps against equal steps: errors, steps and times.
 
     python benchmarks/adaptive.py [--quick] [--out FOLDER]
 
 Kepler's problem at eccentricity 0.9, Pleiades, and the paper's double pendulum whose inner
-mass is 200 times lighter (case d). Errors are the largest of positions at eight times,
-which lie within steps, against explicit Runge-Kutta solutions in minimal coordinates. For
-each run with a controller the steps of one length that the same error takes are read off
-the line through the runs at halving steps; rejected steps count. Writes adaptive.csv,
-adaptive.json and adaptive.png.
+mass is 200 times lighter (case d). Errors are the largest of positions at eight times
+within steps, against explicit Runge-Kutta solutions in minimal coordinates. For each
+adaptive run, the number of equal steps with the same error is interpolated between runs
+with repeatedly halved steps; rejected steps count. Writes adaptive.csv, adaptive.json and
+adaptive.png.
 """
 
 import csv
@@ -117,7 +117,7 @@ def our_rows(quick: bool) -> list[harness.Row]:
 
 
 def _compare(rows: list[harness.Row]) -> None:
-    """Adds what steps of one length take for the same error, where they reach it."""
+    """Adds the number of equal steps with the same error, if these reach it."""
     good = [row for row in rows if row["kind"] == "fixed" and not row["failed"]]
     # From the shortest steps on, as long as the error grows: the errors of long steps on
     # a chaotic motion are no measure.

@@ -1,4 +1,4 @@
-"""Ten thousand double pendulums at once, beside diffrax.
+"""Ten thousand double pendulums in one batch, compared with diffrax.
 
     python benchmarks/batch.py [--out FOLDER] [--quick]
 
@@ -26,8 +26,8 @@ import enerjax as ej
 
 
 H = 1e-3
-# Largest errors of a right answer: of positions against the reference, of the energy (some
-# 10 J change between its forms), and of a lane against its run alone.
+# The largest errors of a correct result: of positions, of the energy (about 10 J are
+# exchanged between its forms), and of a lane compared with a single run.
 ERROR_BOUND, ENERGY_BOUND, LANE_BOUND = 1e-4, 1e-10, 1e-10
 CHUNKS = (16, 64, 256)
 G = 9.81
@@ -132,7 +132,7 @@ def reference(m: np.ndarray, end: float) -> np.ndarray:
 
 
 def lane_alone(steps: int = 1000, count: int = 64, lane: int = 7) -> harness.Row:
-    """How far a lane of a batch is from its run alone, and its energy from the start."""
+    """The difference of a lane from a single run, and the change of its energy."""
     m, h = lanes(count)
     run = ours(steps)
     q, v, _ = jax.jit(jax.vmap(run))(m, h)

@@ -10,8 +10,8 @@ from references import Minimal
 import enerjax as ej
 
 
-# Errors are the largest at these parts of a run: the end alone can be a lucky moment,
-# where the leading errors of two steps have different signs.
+# Errors are the largest at these fractions of a run. At its end alone an error could vanish
+# by chance, where it changes its sign.
 CHECKPOINTS = np.array([0.25, 0.5, 0.75, 1.0])
 
 
@@ -19,8 +19,8 @@ CHECKPOINTS = np.array([0.25, 0.5, 0.75, 1.0])
 class Case:
     """A problem, how long it runs, and in how many steps at the coarsest.
 
-    `coarsest` is by the kind of scheme: high orders need long steps to stay above
-    round-off over two halvings, low orders short ones to show what they tend to.
+    `coarsest` depends on the kind of scheme: high orders need long steps to stay above
+    round-off over two halvings, low orders need short steps to reach their limit.
     """
 
     name: str
@@ -31,7 +31,7 @@ class Case:
     energy_scale: float
     energy_scale_name: str
     constrained: bool = True
-    # Whether V or Phi is more than quadratic in more than one coordinate.
+    # Whether V or Phi is beyond quadratic in more than one coordinate.
     curved: bool = False
     kinematics: bool = False
 
@@ -111,9 +111,9 @@ class Method:
 def methods(case: Case) -> Iterator[list[Method]]:
     """The schemes that are defined on a problem; those of a group share one program.
 
-    Each is listed once. Without constraints the two formulations are one scheme, and so
-    are `KappaDecaying` and `EnergyDecaying`; the discrete gradients differ only where
-    the problem is `curved`.
+    Each is listed once. Without constraints the two formulations are the same scheme, and
+    so are `KappaDecaying` and `EnergyDecaying`; the discrete gradients differ only if the
+    problem is `curved`.
     """
     mean = ej.MeanValue()
     yield [Method("EnergyPreserving()", "EP", ej.EnergyPreserving(), 2)]
@@ -136,7 +136,7 @@ def methods(case: Case) -> Iterator[list[Method]]:
             for a in (0.5, 1.0)
         ]
     if case.constrained:
-        # Its velocities do not satisfy the constraints, to first order in h.
+        # Its velocities violate the constraints to first order in h.
         yield [
             Method(
                 f'EnergyDecaying({a}, "index3")',

@@ -1,4 +1,4 @@
-"""How the cost of a step grows with the number of bodies: chains, beside EXUDYN.
+"""The cost of a step against the number of bodies: chains, compared with EXUDYN.
 
     python benchmarks/chain.py [--out FOLDER] [--quick]
 
@@ -24,16 +24,16 @@ import enerjax as ej
 
 
 H = 1e-3
-# Sizes and steps of their runs, and largest errors of a right answer: of the energy
-# against what all points could fall, of the rods against their length (and of its rate
-# against the length times the speed of the fall), of positions.
+# The numbers of links and steps, and the largest errors of a correct result: of the energy
+# relative to that of the fall, of the rods relative to their length (and of its rate
+# relative to the length times the speed of the fall), and of positions.
 STEPS = {8: 100, 64: 100, 512: 100, 2000: 30, 10000: 10}
 ENERGY_BOUND, LEVEL_BOUND, ERROR_BOUND = 1e-11, 1e-9, 1e-3
 WITH_REFERENCE = 512
 
 
 def reference(num_links: int, end: float) -> np.ndarray:
-    """Positions at the end: points that hang on their neighbours by tensions."""
+    """Positions at the end, of points that are held by the tensions of the rods."""
     length, mass, g = 1 / num_links, 1 / num_links, 9.81
 
     def rates(_, y):

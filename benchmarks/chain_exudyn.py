@@ -54,7 +54,7 @@ def prepared(
     end: float,
     rho: float | None,
 ) -> Callable[[], tuple[np.ndarray, np.ndarray]]:
-    """A run that is yet to be made: the positions and velocities at its end.
+    """A function that runs the chain and returns positions and velocities at its end.
 
     With the generalized-alpha method, or without `rho` the trapezoidal rule of index 2.
     """

@@ -1,4 +1,4 @@
-"""What is measured: a scheme on a problem, at halving steps, against the reference."""
+"""Convergence studies: a scheme on a problem, with halved steps, against the reference."""
 
 import dataclasses
 import math
@@ -12,10 +12,10 @@ import enerjax as ej
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """One run to the end time; the errors are NaN if it failed on the way.
+    """One run to the end time; the errors are NaN if it failed.
 
-    Energies are relative to the scale of the case. `identity_error` is that of the
-    scheme's own balance: the energy plus all that the scheme says it removed.
+    Energies are relative to the scale of the case. `identity_error` is that of the energy
+    identity of the scheme: the change of the energy plus the dissipated energy.
     """
 
     h: float
@@ -139,7 +139,8 @@ def measure(
                 case=case,
                 method=method,
                 runs=runs,
-                # The reference, and sums of rounded steps, resolve no less than this.
+                # Smaller errors are those of the reference, or round-off of the sum of all
+                # steps.
                 slopes_q=slopes(runs, "error_q", max(2 * reference.uncertainty_q, 1e-12)),
                 slopes_v=slopes(runs, "error_v", max(2 * reference.uncertainty_v, 1e-12)),
             )

@@ -1,4 +1,4 @@
-"""What discrete differentiation costs, against `jax.grad` and against Gonzalez.
+"""The cost of discrete differentiation, relative to `jax.grad` and to Gonzalez.
 
 Ten typical potentials and constraints: run time and trace + compile time of the discrete
 gradient as ratios to those of the gradient. And whole steps of `EnergyPreserving`.
@@ -100,7 +100,7 @@ def compiled(fn: Callable, *arguments) -> tuple[Callable, float]:
 
 
 def in_a_loop(fn: Callable) -> Callable:
-    """Many evaluations in one program: what an integrator does, without dispatch."""
+    """Many evaluations in one program, as in an integrator, without dispatch."""
 
     def loop(a, b):
         body = lambda _, x: x + 1e-12 * fn(x, b + 1e-9 * x)

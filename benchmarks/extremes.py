@@ -1,14 +1,13 @@
-"""The map of where each scheme holds, and of what happens outside.
+"""A map of the limits of each scheme, and of what happens beyond them.
 
     python benchmarks/extremes.py [--quick] [--long] [--only AXIS] [--out FOLDER]
 
-One row for each axis, case and scheme: what was asked, what happened, the error against
-something independent (a closed form, an ODE solver in minimal coordinates, the same run
-at unit scale), the energy that the balance does not explain, both levels of the
-constraints, the iterations, and a verdict: `right`, `law holds` where only the balance can
-be judged, `reported failure`, or `WRONG` for a success that is off by more than truncation
-and round-off leave. Writes extremes.csv and
-extremes.png.
+Each row is one scheme for one value on an axis: the parameters, the outcome, the error
+against an independent reference (a closed form, an ODE solver in minimal coordinates, the
+same run at unit scale), the energy that the balance does not explain, both levels of the
+constraints, the iterations, and a verdict. The verdict is `right`, `law holds` if only the
+energy balance can be judged, `reported failure`, or `WRONG` for a success whose error
+exceeds truncation and round-off. Writes extremes.csv and extremes.png.
 """
 
 import argparse
@@ -62,7 +61,7 @@ COLOURS = {"right": "C2", "law holds": "C0", "reported failure": "C1", "WRONG": 
 
 
 def draw(rows: list, path: Path) -> None:
-    """A panel for each axis: error (or leak, where there is no reference) by scheme."""
+    """A panel for each axis: the error (without a reference, the leak) of each scheme."""
     groups = [(axis, list(group)) for axis, group in groupby(rows, lambda r: r.axis)]
     columns = min(3, len(groups))
     lines = -(-len(groups) // columns)

@@ -1,4 +1,5 @@
-"""Bodies and joints: masses, sizes, places, rest, whips, singular poses, long runs."""
+"""Extremes of bodies and joints: masses, sizes, distances from the origin, rest, whips,
+singular poses, long runs."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -44,15 +45,15 @@ def exact(start: tuple[float, float], m1: float, m2: float, t: float) -> Vector:
     """The points at `t`, released at rest."""
     rates, begin = _rates(m1, m2), [*start, 0.0, 0.0]
     if m1 < 1e-4 * m2 and start[0] == start[1]:
-        # Too stiff for the solver; on a taut line the light mass is carried along, and the
-        # heavy one swings at twice the length, to the order of the ratio.
+        # Too stiff for the solver. On a taut line the light mass follows, and the
+        # heavy one swings at twice the length, up to the order of the ratio.
         rates = lambda _, y: [y[2], y[3], *2 * [4.905 * np.cos(y[0])]]
     y = solve_ivp(rates, (0, t), begin, method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
     return _points(y[:2])
 
 
-# Starts: both rods on one line, and those of the paper. With the first the light mass
-# follows the heavy one; with the second it is thrown about, faster the lighter it is.
+# Two starts: both rods on one line, or those of the paper. In the first the light mass
+# follows the heavy one; in the second it is thrown about, the faster the lighter it is.
 STRAIGHT, BENT = (np.pi / 4, np.pi / 4), (0.0, np.pi / 2)
 
 
@@ -118,7 +119,7 @@ def size_rows(quick: bool) -> Iterator[Row]:
 
 
 def rest_rows(quick: bool) -> Iterator[Row]:
-    """An equilibrium is kept, with finite derivatives."""
+    """A system in equilibrium stays there, and its derivatives are finite."""
     double, _, args = ej.problems.double_pendulum()
     hanging = jnp.array([0.0, 1.0, 0.0, 2.0])
     cases = {
@@ -193,7 +194,7 @@ def _repeated_rows(schemes: dict[str, ej.AbstractScheme]) -> Iterator[Row]:
             for skew, lean in ((0.0, 0.0), (1e-12, 0.0), (0.0, 1e-12), (0.0, 1e-6)):
                 numbers = args | dict(skew=skew, lean=lean)
                 solution = run((system, start, numbers), scheme, 0.01, 200)
-                still = lean > 0  # both rows hold in two points alone
+                still = lean > 0  # both constraints hold only at two points
                 error_of = lambda q, v, s=still, o=alone: np.max(
                     np.abs(q - (q[0] if s else o.ys.q))
                 )
@@ -223,7 +224,7 @@ def length_rows(quick: bool, long: bool) -> Iterator[Row]:
 
 
 def exponent(energy: Vector) -> float:
-    """Of the lag, in the root of the mean square of the change over it."""
+    """The exponent with which the root mean square of the change grows with the lag."""
     lags = np.unique(np.logspace(0, 2, 12).astype(int))
     sizes = [np.sqrt(np.mean((energy[k:] - energy[:-k]) ** 2)) for k in lags]
     return float(np.polyfit(np.log(lags), np.log(sizes), 1)[0])

@@ -1,4 +1,4 @@
-"""Oscillators: what a step makes of motion that it resolves, and that it does not."""
+"""Oscillators whose motion a step resolves, and others whose motion it does not."""
 
 from collections.abc import Iterator
 
@@ -12,8 +12,8 @@ import enerjax as ej
 
 
 STEPS = 64
-# What the slow motion beside a stiff spring is asked for: the forces of the spring are
-# rounded, and that is far more than the forces of the others.
+# The tolerance of slow motion beside a stiff spring, whose forces have a round-off far
+# above the other forces.
 DIGITS = 1e-6
 
 
@@ -49,7 +49,7 @@ def alpha_of(scheme) -> float | None:
 
 
 def growth(z: complex, alpha: float | None) -> complex:
-    """What a step multiplies a solution of `y' = lambda y` by, `z = lambda h`.
+    """The factor of one step for `y' = lambda y`, with `z = lambda h`.
 
     The Cayley transform of the energy-preserving scheme; of both decaying families, the
     Pade approximation (2, 2) of the exponential at alpha = 0, (1, 2) at alpha = 1.

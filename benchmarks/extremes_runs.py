@@ -1,4 +1,4 @@
-"""A run at an extreme, and what it is worth."""
+"""A run at an extreme, and its verdict."""
 
 import dataclasses
 from collections.abc import Callable
@@ -18,20 +18,20 @@ Problem = tuple[Any, ej.State, Any]
 RIGHT, REPORTED, WRONG = "right", "reported failure", "WRONG"
 # Where there is nothing to compare with, and the balance of the energy holds.
 LAW = "law holds"
-# What a run may leave unexplained of its energy: Newton's share of a long one.
+# The largest leak: the residuals of Newton's method, summed over a long run.
 LEAK = 1e-9
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """A scheme at one place of an axis; `error` is NaN where there is no reference.
+    """A scheme at one value on an axis; `error` is NaN without a reference.
 
-    - `x`: the place; `asked`: the same in words.
+    - `x`: the value; `asked`: the same in words.
     - `happened`: "success", or the step that failed and the cause.
-    - `error`, `allowed`: distance from the reference, and what the order of the scheme
-      and the round-off of the input leave.
-    - `phase`: what the run itself estimates its phase to be off by.
-    - `leak`: energy that the balance does not explain, of the largest energy moved.
+    - `error`, `allowed`: the difference from the reference, and its bound by the order of
+      the scheme and the round-off of the input.
+    - `phase`: the run's own estimate of its phase error.
+    - `leak`: the energy that the balance does not explain, relative to the largest change.
     """
 
     axis: str
@@ -88,7 +88,7 @@ def judge(
     error = np.nan
     if error_of is not None and not failed:
         error = float(error_of(np.asarray(solution.ys.q), np.asarray(solution.ys.v)))
-    # A comparison with what is not a number is no success.
+    # An error that is NaN is no success.
     okay = leak <= leak_allowed and (error_of is None or error <= allowed)
     good_enough = LAW if error_of is None else RIGHT
     verdict = REPORTED if failed else good_enough if okay else WRONG

@@ -1,8 +1,8 @@
-"""Random systems, gradients and functions: whatever does not hold is a finding.
+"""Random systems, gradients and functions; every property that is violated is a finding.
 
 `python benchmarks/fuzz.py --seed 0 --minutes 10 [--only KIND] [--block N]`. Work comes in
-blocks, each of which compiles one structure and tries it with many numbers; block `N` of a
-seed is always the same, so a finding is seen again with the command in its line.
+blocks, each of which compiles one structure and runs it with many numbers. Block `N` of a
+seed is always the same, so the command in the line of a finding reproduces it.
 """
 
 import argparse
@@ -112,7 +112,7 @@ def show(rows: list[dict[str, Any]]) -> None:
 def run(
     seed: int, seconds: float, kinds: tuple[str, ...], number: int | None, path: Path
 ) -> list[Done]:
-    """Blocks of the kinds, the one next that has had the least time; saved one by one."""
+    """Runs blocks, always of the kind with the least time so far, and saves each."""
     used, next_block = dict.fromkeys(kinds, 0.0), dict.fromkeys(kinds, number or 0)
     all_done: list[Done] = []
     begin = time.monotonic()
@@ -134,7 +134,7 @@ def run(
 
 
 def save(all_done: list[Done], seed: int, path: Path) -> None:
-    """What earlier runs of other seeds and kinds found stays."""
+    """Keeps the findings of earlier runs with other seeds and kinds."""
     old = json.loads(path.read_text()) if path.exists() else []
     ran = {(done.kind, seed) for done in all_done}
     kept = [entry for entry in old if (entry["kind"], entry["seed"]) not in ran]

@@ -1,4 +1,4 @@
-"""What one case of the fuzzing found, and the random systems that cases share."""
+"""The findings of one random case, and the random systems that cases share."""
 
 import dataclasses
 import functools
@@ -14,7 +14,7 @@ import enerjax as ej
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """Findings in words, empty where all holds; and what was measured, larger is worse."""
+    """Findings in words, and measurements, of which larger ones are worse."""
 
     findings: list[str]
     measures: dict[str, float]
@@ -22,7 +22,7 @@ class Result:
 
 @functools.cache
 def structure(n: int) -> dict[str, np.ndarray]:
-    """Which points meet in a system of `n` coordinates; numbers come as arguments."""
+    """The structure of a system of `n` coordinates; its numbers are arguments."""
     points = n // 2
     order = np.random.default_rng(n).permutation(points)
     rods = order[: 2 * (points // 4)].reshape(-1, 2)
@@ -35,7 +35,7 @@ def kinetic(v, args):
 
 
 def potential(q, args):
-    """Quadratic, quartic, waves, wells, and what attracts and repels points of a ring."""
+    """Quadratic and quartic terms, waves, wells, and forces between points of a ring."""
     x = q - args["at"]
     pairs = structure(q.shape[0])["ring"]
     points = q.reshape(-1, 2)
@@ -48,7 +48,7 @@ def potential(q, args):
 
 
 def constraint(q, args):
-    """Rods, a plane, and an ellipsoid; all hold at `at`."""
+    """Rods, a plane, and an ellipsoid, which are all satisfied at `at`."""
     rods = structure(q.shape[0])["rods"]
 
     def squares(q):
@@ -66,7 +66,7 @@ FREE = ej.System(kinetic, potential)
 
 
 def random_args(rng: Generator, n: int, convex: bool) -> dict[str, Any]:
-    """Numbers of a system; of a convex one all that bends the other way is zero."""
+    """The numbers of a system; those of concave terms are zero if it must be convex."""
     points = n // 2
     width = int(np.ceil(np.sqrt(points)))
     rows, columns = np.divmod(np.arange(points), width)
@@ -100,6 +100,6 @@ def random_args(rng: Generator, n: int, convex: bool) -> dict[str, Any]:
 
 
 def random_start(rng: Generator, n: int, args: dict[str, Any]):
-    """Near what the constraints admit, not on it."""
+    """A point near the constraints, but not on them."""
     q = args["at"] + 0.05 * rng.normal(size=n)
     return q, jnp.asarray(rng.normal(size=n) * np.exp(rng.uniform(-2, 1)))

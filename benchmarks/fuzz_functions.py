@@ -1,6 +1,6 @@
-"""Random compositions of what JAX offers, through the chain rule of differences.
+"""Discrete gradients by the chain rule, of random compositions of JAX functions.
 
-`D . (b - a) = f(b) - f(a)` to round-off, and `D = grad f` where both points are one.
+`D . (b - a) = f(b) - f(a)` to round-off, and `D = grad f` at `b = a`.
 """
 
 import functools
@@ -44,7 +44,7 @@ _bump.defvjp(
 
 
 def _newton_root(x):
-    """Three steps towards the cube root, counted."""
+    """Three iterations for the cube root, in a counted loop."""
     target = 2 + jnp.tanh(x)
     return jax.lax.fori_loop(0, 3, lambda _, y: y - (y - target / y**2) / 3, target)
 
@@ -56,7 +56,7 @@ def _scan(x):
 
 
 def _attract(x):
-    """Points in space, all with all, by an inner `vmap`."""
+    """A function of all pairs of points in space, by an inner `vmap`."""
     points = x.reshape(2, 3)
     near = lambda a: jax.vmap(lambda b: 1 / (0.3 + jnp.sum((a - b) ** 2)))(points)
     return x * jnp.sum(jax.vmap(near)(points)) / 4
@@ -133,7 +133,7 @@ UNARY: dict[str, Callable] = {
 
 
 def build(names: tuple[str, ...], joins: tuple[int, ...]) -> Callable:
-    """A scalar function; `noise` changes every value between, relatively."""
+    """A scalar function; `noise` changes every intermediate value relatively."""
 
     def program(x, noise):
         values = [x]
@@ -146,7 +146,7 @@ def build(names: tuple[str, ...], joins: tuple[int, ...]) -> Callable:
 
 
 def cases(rng: Generator, number: int) -> Iterator[tuple[str, Callable[[], Result]]]:
-    """A program; in the first blocks each function is met alone, before any other."""
+    """A random program; in the first blocks it consists of a single function."""
     known = sorted(UNARY)
     for draw in range(DRAWS):
         place = number * DRAWS + draw
@@ -183,7 +183,7 @@ def check(rng: Generator, names: tuple[str, ...], joins: tuple[int, ...]) -> Res
 
 
 def _defects(function, silent, a, b):
-    """In units of what rounding every value between once would do."""
+    """In units of the error by rounding each intermediate value once."""
     value = lambda x: function(x, silent)
     derivative = ej.discrete_grad(value)(a, b)
     size = jnp.zeros(())

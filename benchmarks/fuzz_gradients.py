@@ -1,4 +1,4 @@
-"""Derivatives of short runs: reverse, forward and by differences, of random numbers.
+"""Derivatives of short random runs: in reverse mode, forward mode and by differences.
 
 All lanes of a batch are differentiated together; in a second call of the same program one
 of them fails, and must leave the others as they were.
@@ -38,7 +38,7 @@ SCHEMES: dict[str, Callable[[Any], ej.AbstractScheme]] = {
     "generalized ggl": lambda a: ej.GeneralizedAlpha(1 - a, "ggl"),
     "kappa": ej.KappaDecaying,
 }
-# Which schemes want velocities that are the rates of the coordinates.
+# Schemes that need velocities that are the rates of the coordinates.
 RATES_ONLY = (
     "consistent", "consistent 6", "consistent zero", "rattle", "generalized",
     "generalized ggl",
@@ -47,7 +47,7 @@ RATES_ONLY = (
 
 @dataclasses.dataclass(frozen=True)
 class Family:
-    """Systems that differ in numbers, and how to draw `q`, `v`, `args` and `h` for one."""
+    """Systems that differ only in numbers, and how to draw `q`, `v`, `args` and `h`."""
 
     system: Any
     draw: Callable[[Generator], tuple[Any, Any, Any, float]]
@@ -64,7 +64,7 @@ def _shake(rng: Generator, args: Any) -> Any:
 
 
 def _turning(problem: Callable[[], Any], low: float, high: float):
-    """A problem of the library with its numbers, its start and its step changed."""
+    """A problem of the library with random numbers, start and step."""
 
     def draw(rng: Generator):
         _, start, args = problem()
@@ -89,7 +89,7 @@ def family(name: str) -> Family:
 
 
 def pairs() -> list[tuple[str, str]]:
-    """Families in turn, each with the schemes that take it; halved steps with some."""
+    """Families in turn, each with the schemes that accept it, some with divided steps."""
     turning = [name for name in reversed(SCHEMES) if name not in RATES_ONLY]
     by_family = {
         "halved": ["preserving", "decaying", "consistent"],
@@ -172,7 +172,8 @@ def check(rng: Generator, programs: Programs, name: str) -> Result:
     tried = {k: at(k * EPS) for k in (-2, -1, 1, 2)}
     near, far = tried[1][0] - tried[-1][0], tried[2][0] - tried[-2][0]
     difference = (8 * near - far) / (12 * EPS)
-    # Where the step is divided elsewhere the function jumps, by what truncation is.
+    # If a step is divided at one of the points only, the function jumps by a truncation
+    # error.
     smooth = np.asarray(okay).copy()
     for _, fine, parts in tried.values():
         smooth &= fine & np.all(parts == np.asarray(halvings), axis=1)
@@ -195,7 +196,7 @@ def check(rng: Generator, programs: Programs, name: str) -> Result:
 
 
 def poisoned(rng, programs, flat, unravel, healthy, okay) -> Iterator[str]:
-    """One lane is given a step far too long, or an inertia that is nothing."""
+    """Gives one lane a step that is far too long, or an inertia of zero."""
     lane = int(rng.integers(LANES))
     for what in ("long step", "not a number"):
         p = unravel(flat)

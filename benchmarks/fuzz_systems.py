@@ -1,4 +1,4 @@
-"""Random systems: the account of the energy, the constraints, and the end.
+"""Random systems: the energy balance, the constraints, and the end of the motion.
 
 The end is compared with a run sixteen times finer and with an explicit solver of high
 order, which shares nothing with the schemes.
@@ -22,7 +22,7 @@ import enerjax as ej
 
 STEPS, FINER, DRAWS = 12, 16, 18
 SIZES = (8, 20, 40, 80)
-# Each with the order that its error shows, and whether it keeps an account of the energy.
+# Each with the order of its error, and whether it has an energy identity.
 SCHEMES: dict[str, tuple[Callable[[float], ej.AbstractScheme], int, bool]] = {
     "preserving": (lambda a: ej.EnergyPreserving(), 2, True),
     "consistent": (ej.EnergyConsistent, 3, True),
@@ -107,7 +107,7 @@ def fastest(start: ej.State, args: Any) -> Any:
 
 
 def laws(run, name, alpha, convex, accounts, measures) -> Iterator[str]:
-    """What holds at every step, however long."""
+    """Properties that hold for steps of any length."""
     audit = run.audit
     good = np.isfinite(audit.kinetic)
     size = np.max(np.abs(audit.kinetic[good])) + np.max(np.abs(audit.potential[good])) + 1
@@ -134,7 +134,7 @@ def laws(run, name, alpha, convex, accounts, measures) -> Iterator[str]:
 
 
 def ends(runs, truth, start, order, pace, measures) -> Iterator[str]:
-    """Whether what is called a success is one."""
+    """Whether a run that reports success is correct."""
     causes = [ej.RESULTS[run.result].partition(".")[0] for run in runs]
     failed = [bool(run.result != ej.RESULTS.successful) for run in runs]
     measures["failed"] = max(measures.get("failed", 0.0), float(sum(failed)))
@@ -149,7 +149,7 @@ def ends(runs, truth, start, order, pace, measures) -> Iterator[str]:
     text = "errors " + " ".join(f"{x:.1e}" for x in errors)
     if pace <= CALM:
         measures["error"] = float(np.max(np.where(failed, 0, errors)))
-    # Beyond, a sixteenth of the step does not resolve the motion either.
+    # Otherwise a sixteenth of the step does not resolve the motion either.
     if pace < 1 and errors[2] > (0.3 if order == 1 else 0.02):
         yield f"the finer run is far from the explicit solver: {text}"
     for error, bad in zip(errors[:2], failed[:2], strict=True):

@@ -1,4 +1,4 @@
-"""What a derivative costs: time and memory of the reverse pass beside the forward run.
+"""The cost of a derivative: time and memory of the reverse pass and the forward run.
 
     python benchmarks/gradient.py [--out FOLDER] [--quick]
 
@@ -77,7 +77,7 @@ def case_of(make: Callable, kind: str, steps: int) -> tuple[Callable, Callable, 
 def disagreement(
     end: Callable, value: Callable, consistent: Callable, numbers: Any, gradient: Any
 ) -> tuple[float, float]:
-    """Of the gradient with forward mode and with differences, along a direction.
+    """Errors of the gradient against forward mode and differences along a direction.
 
     `value` is the compiled `end`. The start moves along the constraints.
     """

@@ -1,4 +1,4 @@
-"""What the benchmarks share: one core, processes of their own, medians of turns.
+"""The harness of the benchmarks: one core, one process for each setting, medians.
 
 A benchmark starts itself once for each setting of XLA, with `--mode`, because XLA reads
 its settings only once; the child prints its rows as the last line of its output.
@@ -37,12 +37,11 @@ def run(
 ) -> None:
     """The main program of a benchmark.
 
-    `rows_of` makes the rows of one setting, in a process of its own, and `peers` those of
-    other programs, here (twice where they tell their time of a step); both are told whether
-    a quick look is wanted. `modes`: the settings of XLA. They are shown, drawn, and saved
-    under the name of the script. With `works` both also take names of these, one or all of
-    them; rows tell theirs as `work`, and those of one that is run again replace what was
-    saved.
+    `rows_of` measures the rows of one setting in a separate process, and `peers` those of
+    other programs in this process (twice if these measure the time of a step). Both get a
+    flag for a quick run. `modes` are the settings of XLA. The rows are printed, drawn, and
+    saved under the name of the script. With `works` both also get the names of the works to
+    measure; each row has its name as `work`, and replaces saved rows of the same work.
     """
     chosen = _options(sys.modules["__main__"].__doc__ or "", works)
     asked = (
@@ -63,7 +62,8 @@ def run(
     others = peers(*asked)
     rows = _children(script, flags, modes)
     if any(_TIME in row for row in others):
-        # They cannot take turns with ours: before and after, and the faster time counts.
+        # Their runs cannot alternate with ours. They run before and after, and the faster
+        # time counts.
         pairs = zip(others, peers(*asked), strict=True)
         others = [min(pair, key=lambda row: row[_TIME]) for pair in pairs]
     rows = others + rows
@@ -89,13 +89,13 @@ def _options(doc: str, works: Sequence[str]) -> argparse.Namespace:
 
 
 def _pin() -> None:
-    """Keep to one core: times of two are not comparable."""
+    """Restricts this process to one core, so that times are comparable."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
 
 def _children(script: str, flags: list[str], modes: Sequence[str]) -> list[Row]:
-    """The rows of a child for each setting; a GPU knows only one."""
+    """The rows of one child process for each setting; a GPU has only one setting."""
     rows: list[Row] = []
     for mode in modes:
         command = [sys.executable, script, "--mode", mode, *flags]
@@ -123,8 +123,7 @@ def device() -> Row:
 
 
 def clock() -> float:
-    """Seconds: of the processor, so that other processes do not count; of the wall where
-    the work is done elsewhere."""
+    """Processor seconds, so that other processes do not count; wall time on a GPU."""
     on_cpu = jax.default_backend() == "cpu"
     return time.process_time() if on_cpu else time.perf_counter()
 
@@ -143,8 +142,8 @@ def run_of(
     *,
     every: int | None = None,
 ) -> Callable[..., ej.Solution]:
-    """The run of `(start, args, h)` with `steps` steps, saved `every` so many of them or
-    at its end. A run that fails ends with its last state: who calls looks at the error."""
+    """A run of `steps` steps as a function of `(start, args, h)`, saved at every `every`-th
+    step or at its end. The caller must check the error, which shows a failed run."""
 
     def run(start: ej.State, args: Any, h: Any) -> ej.Solution:
         saveat = ej.SaveAt(every=steps if every is None else every)
@@ -155,7 +154,7 @@ def run_of(
 
 
 def medians(programs: Sequence[Callable[[], Any]], repeats: int) -> list[float]:
-    """Seconds of each program, run in turn: a busy moment of the machine meets them all."""
+    """Seconds of each program. They run in turn, so that other load affects all of them."""
     times: list[list[float]] = [[] for _ in programs]
     for _ in range(repeats):
         for program, record in zip(programs, times, strict=True):

@@ -63,7 +63,7 @@ def residuals(parameters: dict[str, Any], data: jax.Array) -> jax.Array:
 
 
 def named(x: Any) -> dict[str, Any]:
-    """Parameters from what is sought: the logarithms of those that are positive."""
+    """The parameters, from unknowns that are logarithms of positive ones."""
     pairs = zip(POSITIVE.items(), x, strict=True)
     return {name: jnp.exp(y) if positive else y for (name, positive), y in pairs}
 

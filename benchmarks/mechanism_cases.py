@@ -1,4 +1,4 @@
-"""The problems with published motions, and how a state is compared with them."""
+"""The problems with published motions, and the quantities that are compared."""
 
 import dataclasses
 import json
@@ -20,7 +20,7 @@ Published = list[tuple[float, Vector, Vector]]  # time, positions, velocities
 class Case:
     """A problem, its published motion, and the longest of three steps, each half the last.
 
-    `observe` takes the coordinates and velocities of a run to what was published.
+    `observe` maps the coordinates and velocities of a run to the published quantities.
     """
 
     name: str

@@ -1,12 +1,12 @@
-"""Published motions of mechanisms and particles, met at three steps.
+"""Comparison with published motions of mechanisms and particles, for three step lengths.
 
     python benchmarks/mechanisms.py [--quick] [--out FOLDER]
 
-Every problem of the package with a motion in the literature, or one that is known exactly,
-against these values (`data/mechanisms.json` names their sources). Errors are the largest
-over all published times; orders are those of the last halving. Energies are relative to
-the largest kinetic energy: `balance` is what the work of drives and the dissipation of the
-scheme leave unexplained. Writes mechanisms.csv and mechanisms.png.
+Every problem of the package whose motion is published or known exactly is compared with
+these values (`data/mechanisms.json` names their sources). Errors are the largest over all
+published times; orders are those of the last halving. Energies are relative to the largest
+kinetic energy: `balance` is the change that the work of drives and the dissipation of the
+scheme do not explain. Writes mechanisms.csv and mechanisms.png.
 """
 
 import argparse

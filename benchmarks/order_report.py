@@ -83,7 +83,7 @@ def _cells(row: Row) -> tuple[str, ...]:
 
 
 def write_csv(table: list[Row], path: Path) -> None:
-    """One line a run; the slope is that of the halving which ends there."""
+    """One line for each run, with the slope from the run before it."""
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(_records(table[0])[0]))
         writer.writeheader()
@@ -127,7 +127,7 @@ def write_json(table: list[Row], path: Path, seconds: float) -> None:
 
 
 def write_picture(table: list[Row], path: Path) -> None:
-    """Error in q against h for every problem, with a line for each order of theory."""
+    """Error in q against h for every problem, with a line for each theoretical order."""
     names = list(dict.fromkeys(row.method.name for row in table))
     styles = {
         name: dict(color=f"C{k % 10}", marker="os^Dv"[k // 10 % 5])

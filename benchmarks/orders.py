@@ -1,4 +1,4 @@
-"""The order table, measured: every scheme at halving steps against references.
+"""Measured orders: every scheme with repeatedly halved steps against references.
 
     python benchmarks/orders.py [--quick] [--out FOLDER]
 

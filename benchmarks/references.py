@@ -1,7 +1,7 @@
 """Independent solutions: explicit Runge-Kutta in minimal coordinates, without JAX.
 
-Every equation here is written down afresh from the mechanics, so that no mistake can be
-shared with the library: no constraints, no multipliers, no discrete derivatives.
+The equations here are derived independently of the library, so that both cannot share a
+mistake: there are no constraints, no multipliers and no discrete derivatives.
 """
 
 import dataclasses
@@ -37,7 +37,7 @@ class Minimal:
 
 @dataclasses.dataclass(frozen=True)
 class Reference:
-    """The motion at some times, and how far it changes with a tenfold tolerance."""
+    """The motion at some times, and its change if the tolerance is ten times larger."""
 
     q: Vector
     v: Vector
@@ -58,7 +58,7 @@ def _states(
     mechanism: Minimal, args: Args, times: Vector, tolerance: float
 ) -> tuple[Vector, Vector]:
     now, y, states = 0.0, mechanism.start(args), []
-    # From one time to the next: the interpolant between steps is less accurate.
+    # Each time is the end of an integration, because an interpolant is less accurate.
     for time in times:
         solution = solve_ivp(
             lambda _, y: mechanism.rates(y, args),

@@ -93,7 +93,7 @@ def peer_rows(quick: bool, names: Sequence[str]) -> list[harness.Row]:
 
 
 def cheapest(rows: list[harness.Row], error: float) -> dict[str, float]:
-    """Milliseconds of the cheapest run of each solver that is at least so accurate."""
+    """Milliseconds of the cheapest run of each solver that reaches this accuracy."""
     best: dict[str, float] = {}
     for row in rows:
         if row["error"] <= error and "seconds" in row:
@@ -117,7 +117,7 @@ def show(rows: list[harness.Row]) -> None:
 
 
 def _ratios(tables: list[dict[str, float]], kind: str) -> str:
-    """How many times longer the best solver of a kind takes than the best of ours."""
+    """The time of the best solver of a kind, relative to that of our best scheme."""
     best = lambda table, kind: min(
         (ms for solver, ms in table.items() if solver.startswith(kind)), default=np.inf
     )

@@ -1,5 +1,7 @@
-"""Chains of points on rods for solvers that call Python: compiled, so that the time is
-that of the solver. Gravity acts along +y. Needs numba, of the extra `peers`."""
+"""Chains of points on rods for solvers that call Python.
+
+The functions are compiled with numba (of the extra `peers`), so that the time is that of
+the solver. Gravity acts along +y."""
 
 # pyright: reportMissingImports=false
 

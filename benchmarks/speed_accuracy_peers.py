@@ -1,5 +1,6 @@
-"""Other programs on the problems of `speed_accuracy.py`. Each yields its rows, or none
-where it is not installed."""
+"""Other programs on the problems of `speed_accuracy.py`.
+
+Each yields its rows, or none if it is not installed."""
 
 # pyright: reportArgumentType=false, reportMissingImports=false, reportAttributeAccessIssue=false
 
@@ -23,7 +24,7 @@ Run = Callable[[], np.ndarray]
 
 
 def _timed(prepare: Callable[[], Run], repeats: int) -> tuple[np.ndarray, float]:
-    """The positions at the end, and the seconds that a run took; preparing it is free."""
+    """The positions at the end, and the seconds of a run without its preparation."""
     end, times = prepare()(), []
     for _ in range(repeats):
         run = prepare()
@@ -42,7 +43,7 @@ def _row(
     prepare: Callable[[], Run],
     repeats: int,
 ) -> Rows:
-    """No time is told of an answer that is none."""
+    """No time is reported for a wrong result."""
     try:
         q, seconds = _timed(prepare, repeats)
     except Exception as error:
@@ -198,7 +199,7 @@ def ida_rows(work: Work, exact: np.ndarray, repeats: int) -> Rows:
     rate0[:, 3] = G
     algebraic = [6 * k + j for k in range(size) for j in (4, 5)]
     band = dict(linsolver="band", lband=11, uband=11) if size > 2 else {}
-    # The more points, the sooner smaller tolerances are not met, or take minutes.
+    # With many points small tolerances are not reached, or take minutes.
     tolerances = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
     for tolerance in tolerances[: 5 if size <= 2 else 4 if size <= 8 else 2]:
         bounds = np.full(y0.size, tolerance)

@@ -1,4 +1,4 @@
-"""The problems of `speed_accuracy.py`, with their answers."""
+"""The problems of `speed_accuracy.py`, with their reference results."""
 
 import dataclasses
 import functools
@@ -13,16 +13,16 @@ import enerjax as ej
 
 
 G = 9.81
-# What counts as an answer at all: no time is told for other runs.
+# Runs with larger errors are wrong, and their times are not reported.
 BOUND = 0.1
 Steps = dict[str, tuple[float, ...]]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Work:
-    """A chain of points with these masses on rods of one length, or the heavy top.
+    """A chain of points with these masses on rods of equal length, or the heavy top.
 
-    `steps`: for each scheme those that are tried.
+    `steps`: the numbers of steps for each scheme.
     """
 
     masses: tuple[float, ...]
@@ -72,7 +72,7 @@ class Work:
 
 
 def chain_rates(y: np.ndarray, masses: np.ndarray) -> np.ndarray:
-    """Points that hang on their neighbours by tensions; gravity acts along +y."""
+    """Points that are held by the tensions of rods; gravity acts along +y."""
     size = masses.size
     q, v = y.reshape(2, size, 2)
     links = np.diff(q, axis=0, prepend=np.zeros((1, 2)))

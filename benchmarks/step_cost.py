@@ -1,4 +1,4 @@
-"""What a step costs: our schemes beside EXUDYN, on the double pendulum and the heavy top.
+"""The cost of a step: our schemes and EXUDYN, on the double pendulum and the heavy top.
 
     python benchmarks/step_cost.py [--out FOLDER] [--quick]
 
@@ -21,7 +21,7 @@ import enerjax as ej
 
 
 REPEATS, QUICK_REPEATS = 7, 2
-# When the errors are taken.
+# The time at which errors are measured.
 PENDULUM_END, TOP_END = 10.0, 1.0
 # Schemes, steps, and the largest error that is still a right answer.
 PENDULUM = [
@@ -103,7 +103,7 @@ def our_rows(quick: bool) -> list[harness.Row]:
 
 
 def exudyn_rows(quick: bool) -> list[harness.Row]:
-    """The same work by EXUDYN, or no rows where it is not installed."""
+    """The same work by EXUDYN, or no rows if it is not installed."""
     try:
         import step_cost_exudyn
     except ImportError:

@@ -63,7 +63,7 @@ def _top():
 
 
 def prepared_top(h: float, end: float) -> Callable[[], tuple[np.ndarray, ...]]:
-    """A run of the top that is yet to be made: where it ends.
+    """A function that runs the top and returns its end.
 
     Position, velocity, and angular velocity in axes of the body.
     """

@@ -1,4 +1,4 @@
-"""The slow motion of a stiff double pendulum, at steps that hardly see the fast one.
+"""The slow motion of a stiff double pendulum, with steps that hardly resolve the fast one.
 
     python benchmarks/stiff.py [--out FOLDER] [--quick]
 
@@ -36,7 +36,7 @@ SCHEMES: dict[str, Callable[..., ej.AbstractScheme]] = {
     "generalized-alpha": ej.GeneralizedAlpha,
     "generalized-alpha, GGL": lambda rho: ej.GeneralizedAlpha(rho, "ggl"),
 }
-# They have no radius to choose.
+# Schemes without a spectral radius as parameter.
 CONSERVING: dict[str, Callable[[], ej.AbstractScheme]] = {
     "EnergyPreserving": lambda: ej.EnergyPreserving(),
     "EnergyConsistent(0)": lambda: ej.EnergyConsistent(0.0),
@@ -82,7 +82,7 @@ def _run(
 
 
 def _outcome(run: Callable[[], ej.Solution], end: np.ndarray) -> harness.Row:
-    """The error and the time, or why there are none."""
+    """The error and the time, or the reason why there are none."""
     sol = run()
     if sol.result != ej.RESULTS.successful:
         return dict(failed=str(ej.RESULTS[sol.result]).partition(":")[0])

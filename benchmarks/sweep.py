@@ -1,4 +1,4 @@
-"""A sweep of ten thousand runs, beside the same runs in a bare loop over batches.
+"""A sweep of ten thousand runs, compared with a plain loop over batches.
 
     python benchmarks/sweep.py [--out FOLDER] [--quick]
 
@@ -53,7 +53,7 @@ def preserving() -> Callable:
 
 
 def cases(quick: bool) -> dict[str, tuple[Callable, dict[str, Any], dict[str, Any]]]:
-    """Name: the function of a lane, what is swept, and the same for each lane."""
+    """For each name the function of a lane, the parameters, and those of each lane."""
     count = 500 if quick else 10_000
     m, h = batch.lanes(count)
     lanes = {"lane": {"m": m, "h": h}}
@@ -88,7 +88,7 @@ class Programs:
 
 
 def swept(fn: Callable, over: dict[str, Any]) -> tuple[np.ndarray, harness.Row]:
-    """The results of a sweep, and what it cost."""
+    """The results of a sweep and its costs."""
     moments: list[tuple[int, float]] = []
     watch = lambda lanes, total: moments.append((lanes, harness.clock()))
     begin = harness.clock()
@@ -104,7 +104,7 @@ def swept(fn: Callable, over: dict[str, Any]) -> tuple[np.ndarray, harness.Row]:
 
 
 def compared(fn: Callable, over: dict[str, Any], each: dict[str, Any]) -> harness.Row:
-    """A sweep beside the loop over batches, in turns."""
+    """Times of a sweep and of the loop over batches, which run in turn."""
     count = len(jax.tree.leaves(each)[0])
     loop = lambda lanes: jax.lax.map(
         lambda lane: fn(**lane), lanes, batch_size=batch.CHUNKS[0]
