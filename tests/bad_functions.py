@@ -1,4 +1,4 @@
-"""A system to spoil, and malformed functions of it: the error, a part of its message."""
+"""A system, and malformed functions for it with the error and a part of its message."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Malformed inputs: what is given, the error, and a part of its message."""
+"""Malformed inputs with the error and a part of its message."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""A pendulum whose pivot is moved, and the schemes that it is driven with."""
+"""A pendulum with a moving pivot, and the schemes that integrate it."""
 
 import jax
 import jax.numpy as jnp

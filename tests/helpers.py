@@ -65,7 +65,7 @@ SCHEMES = {
 
 
 def long(names, *slow):
-    """Parameters of a test, of which those that take long are left to `-m slow`."""
+    """Parameters of a test, of which the slow ones are marked `slow`."""
     assert set(slow) <= set(names)
     mark = [pytest.mark.slow]
     return [pytest.param(x, marks=mark if x in slow else []) for x in names]
@@ -80,7 +80,7 @@ def problem(name):
 
 @functools.cache
 def solve(name, scheme, alpha=0.0, *, h, steps, save_every=1):
-    """A run; a failure is left in its `result`."""
+    """A run; its `result` tells whether it failed."""
     system, start, args = problem(name)
     solution = ej.simulate(
         system,
@@ -96,7 +96,7 @@ def solve(name, scheme, alpha=0.0, *, h, steps, save_every=1):
 
 
 def on_host(solution):
-    """The same fields with NumPy arrays: to take them apart compiles nothing."""
+    """The same fields as NumPy arrays, which can be indexed without compilation."""
     host = jax.device_get(solution)
     energy = np.asarray(solution.audit.energy)
     audit = SimpleNamespace(**vars(host.audit), energy=energy)

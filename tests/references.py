@@ -1,4 +1,4 @@
-"""Solutions that owe nothing to the package: other methods, and the literature."""
+"""Solutions that are independent of the package: other methods, and the literature."""
 
 import functools
 from types import SimpleNamespace

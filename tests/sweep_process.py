@@ -1,4 +1,4 @@
-"""A small sweep, also as a process of its own: killed, resumed, or one of several.
+"""A small sweep, which can run as a separate process: killed, resumed, or one of several.
 
 python -m tests.sweep_process RESULT [--path FOLDER] [--die-after LANES]
                              [--process K --port P]

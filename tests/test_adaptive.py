@@ -1,4 +1,4 @@
-"""Steps of varying length: their errors, their energy, their derivatives."""
+"""Adaptive steps: their errors, their energy, their derivatives."""
 
 import functools
 from typing import Any
@@ -183,7 +183,7 @@ def test_schemes_with_a_memory_of_the_step_are_refused():
         adaptive("pendulum", ej.GeneralizedAlpha(0.9), 1e-6, 1.0)
 
 
-def test_bad_controllers():
+def test_bad_controllers_are_refused():
     with pytest.raises(ValueError, match="must be positive"):
         ej.StepController(1e-6, 0.0)
     system, start, args = problem("pendulum")

@@ -1,4 +1,4 @@
-"""Equilibria, vibrations about them, and the freedoms of mechanisms."""
+"""Equilibria, vibrations about them, and the degrees of freedom of mechanisms."""
 
 import jax
 import jax.numpy as jnp
@@ -80,7 +80,7 @@ def test_a_horizontal_arm_comes_to_rest(stiffness):
     np.testing.assert_allclose(slope, by_hand, rtol=1e-9)  # round-off
 
 
-def test_no_equilibrium_is_told():
+def test_a_missing_equilibrium_raises_an_error():
     system, start, args = problem("particles")
     free = ej.System(system.kinetic, lambda q, args: q[1])
     with pytest.raises(ValueError, match="No equilibrium was found"):
@@ -122,7 +122,7 @@ def test_modes_of_a_ring_of_springs():
     np.testing.assert_allclose(found.eigenvalues, exact, atol=1e-12 * k / m * n)
 
 
-def test_a_pendulum_on_its_head_is_unstable():
+def test_an_inverted_pendulum_is_unstable():
     system, _, args = problem("pendulum")
     growth = []
     for y in (1.0, -1.0):
@@ -131,7 +131,7 @@ def test_a_pendulum_on_its_head_is_unstable():
     np.testing.assert_allclose(growth, [np.sqrt(9.81), -np.sqrt(9.81)], rtol=1e-12)
 
 
-def test_a_pose_that_is_no_equilibrium_has_no_modes():
+def test_a_pose_out_of_balance_has_no_modes():
     system, start, args = problem("pendulum")  # horizontal: its weight is not carried
     with pytest.raises(ValueError, match="out of balance: -9.81 along coordinate 1"):
         ej.modes(system, start, args)

@@ -110,7 +110,7 @@ def test_energy_consistent_never_gains_energy_where_the_potential_is_concave(nam
     assert np.max(np.abs(leak)) <= 20 * EPS * scale
 
 
-def test_energy_decaying_gains_energy_there_and_says_so():
+def test_energy_decaying_gains_energy_there_and_reports_it():
     """V_jump has either sign; the identity holds all the same."""
     solution = concave("angle from 3.0 rad", "decaying", 1.0)
     assert not failed(solution)
@@ -158,7 +158,7 @@ def _turning(q, args):
     return jnp.stack([turn, jnp.concatenate([up, up])])
 
 
-def test_the_momenta_of_named_symmetries_are_followed():
+def test_the_audit_reports_the_momenta_of_symmetries():
     def potential(q, args):
         x = q[:3] - q[3:]
         return 0.5 * args["k"] * (x @ x - 1.0) ** 2
@@ -178,7 +178,7 @@ def test_the_momenta_of_named_symmetries_are_followed():
         assert np.max(drift[:, 1]) <= 1e-13
 
 
-def test_an_audit_tells_itself_in_short():
+def test_printing_an_audit_shows_a_summary():
     system, start, args = problem("spring")
     scheme = ej.EnergyDecaying(0.5)
     audit = ej.simulate(system, scheme, start, args, h=STEP["spring"], num_steps=200).audit

@@ -1,4 +1,4 @@
-"""Bad input: one clear error before any step, wherever it can be known then."""
+"""Bad input raises one clear error, before any step if possible."""
 
 import subprocess
 import sys
@@ -14,7 +14,7 @@ from .bad_inputs import BAD, WRONG_TYPES
 from .helpers import problem
 
 
-def test_the_input_that_the_others_spoil_is_good():
+def test_the_unmodified_input_is_accepted():
     assert simulate().stats.completed_steps == 4
 
 
@@ -37,12 +37,12 @@ def test_a_state_is_made_of_numbers(bad, is_type_checked):
         ej.State(bad, [0.0, 0.0])
 
 
-def test_bad_shapes_are_told_under_jit_too():
+def test_bad_shapes_raise_an_error_under_jit_too():
     with pytest.raises(ValueError, match="must return a vector"):
         jax.jit(lambda h: simulate(constraint=lambda q, args: q @ q - 1, h=h))(0.01)
 
 
-def test_lanes_that_devices_would_mix_are_refused():
+def test_numbers_that_vary_over_devices_are_refused():
     by_device = jax.sharding.PartitionSpec("lanes")
     mesh = jax.make_mesh((1,), ("lanes",), axis_types=(jax.sharding.AxisType.Auto,))
     run = lambda m: simulate(args=ARGS | dict(m=m[0])).ys.q[None]
@@ -85,13 +85,13 @@ def test_single_precision_is_warned_of_once_and_works():
     assert done.returncode == 0, done.stderr
 
 
-def test_a_run_that_does_not_fit_into_memory_says_what_to_do():
+def test_exhausted_memory_raises_an_error_with_remedies():
     system, start, args = problem("pendulum")
     with pytest.raises(MemoryError, match=r"10{12} steps.*SaveAt"):
         ej.simulate(system, ej.EnergyPreserving(), start, args, h=1e-3, num_steps=10**12)
 
 
-def test_a_function_without_return_is_asked_for_it():
+def test_a_function_without_return_raises_an_error():
     def potential(q, args):
         q @ q  # pyright: ignore
 

@@ -212,13 +212,13 @@ def test_a_joint_that_repeats_others_is_named():
         ej.Scene([*PENDULUM, again]).start()
 
 
-def test_a_drive_of_what_is_held_already_is_named():
+def test_a_drive_along_a_constrained_direction_is_named():
     ram = ej.drives.Distance("ram", "ground", "inner", lambda t, args: 1.0 + 0.0 * t)
     with pytest.raises(ValueError, match="'ram' repeats"):
         ej.Scene([*PENDULUM, ram]).start()
 
 
-def test_what_a_scene_cannot_tell_is_refused():
+def test_questions_that_a_scene_cannot_answer_are_refused():
     dot, rod, box = (ej.Scene([part]) for part in (DOT, ROD, BOX()))
     no_name: Any = ROD
     of = lambda scene: ej.State(scene.q, scene.v)

@@ -1,4 +1,4 @@
-"""Schemes cannot be made from numbers that they are not defined for."""
+"""Schemes refuse parameters for which they are not defined."""
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +47,7 @@ def test_a_scheme_cannot_be_made_from_bad_numbers(make, message):
         ),
     ],
 )
-def test_a_scheme_cannot_be_made_from_what_it_does_not_know(make, message, is_type_checked):
+def test_unknown_formulations_are_refused(make, message, is_type_checked):
     if is_type_checked:
         pytest.skip("the type checker refuses it first")
     with pytest.raises(ValueError, match=message):
@@ -72,7 +72,7 @@ def test_a_derivative_without_parentheses(scheme, is_type_checked):
         scheme(*numbers, derivative=ej.ChainRule)  # pyright: ignore
 
 
-def test_what_a_step_is_given_must_fit(is_type_checked):
+def test_the_arguments_of_a_step_must_fit(is_type_checked):
     system, start, args = problem("pendulum")
     one = ej.step(system, ej.EnergyPreserving(), start, args, h=0.01)
     with pytest.raises(ValueError, match="`warm` is not of this scheme"):

@@ -1,4 +1,4 @@
-"""Generalized-alpha and RATTLE: against the methods written afresh, and known motions."""
+"""Generalized-alpha and RATTLE against independent implementations and known motions."""
 
 import functools
 
@@ -200,7 +200,7 @@ def test_newmark_is_the_trapezoidal_rule():
     assert change(ej.GeneralizedAlpha.hht(-0.3)) > 1e-2
 
 
-def test_derivatives_pass_through_what_is_carried():
+def test_derivatives_pass_through_the_carried_acceleration():
     system, start, args = problem("pendulum")
 
     def end(g, rho):

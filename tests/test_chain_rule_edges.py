@@ -113,7 +113,7 @@ def test_complex_numbers_inside():
 
 
 def test_a_stiff_contact_runs():
-    """A Hertzian floor: zero force above it, from the first step on."""
+    """A Hertzian floor, which exerts no force on what is above it, as in the first step."""
     floor = lambda q, args: 9.81 * q[0] + 1e4 * jnp.maximum(-q[0], 0.0) ** 2.5
     system = ej.System(jnp.eye(1), floor)
     start = ej.initial_state(system, [0.1], [0.0])

@@ -1,4 +1,4 @@
-"""The classics of numerical integration: closed forms, published values."""
+"""Classical problems of numerical integration: closed forms, published values."""
 
 import numpy as np
 import pytest

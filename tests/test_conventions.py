@@ -1,4 +1,4 @@
-"""The rules that the package is written by."""
+"""The conventions of the source."""
 
 import ast
 import importlib
@@ -86,7 +86,7 @@ def all_imports(name):
 
 
 def test_the_imports_are_seen():
-    """Against a parser that finds nothing."""
+    """A parser that finds no imports would make the other tests pass."""
     assert "enerjax._operators" in all_imports("schemes")
     assert "enerjax._discrete.base" in all_imports("_discrete")
     assert "_system" in {x for path in files_of("problems") for x in parts_imported(path)}

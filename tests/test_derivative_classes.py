@@ -1,4 +1,4 @@
-"""Discrete derivatives that a user writes: believed where they hold what they promise."""
+"""Discrete derivatives of users, which are checked at the start of a run."""
 
 from typing import ClassVar
 
@@ -42,14 +42,14 @@ def test_a_derivative_that_is_not_directional_is_refused():
         run(Midpoint())
 
 
-def test_one_that_says_so_is_used_and_the_audit_shows_the_loss():
+def test_a_declared_one_is_used_and_the_audit_shows_the_loss():
     audit = run(AdmittedMidpoint()).audit
     leak = np.abs(audit.energy - audit.energy[0])
     # Truncation: the midpoint rule keeps the energy to second order.
     assert 1e-5 < np.max(leak) < 1e-1
 
 
-def test_one_that_is_exact_for_the_energies_at_hand_is_used():
+def test_one_that_is_exact_for_the_energies_of_the_system_is_used():
     oscillator = ej.System(lambda v, args: 0.5 * v @ v, lambda q, args: 2.0 * q @ q)
     start = ej.State([1.0], [0.0])
     scheme = ej.EnergyPreserving(derivative=Midpoint())

@@ -81,7 +81,7 @@ def test_both_levels_hold_at_the_times_of_the_rows():
     assert np.max(np.abs(run.audit.constraint_rate)) <= 1e-12
 
 
-def test_the_audit_adds_up_with_the_work_of_the_drive():
+def test_the_energy_balance_includes_the_work_of_the_drive():
     audit = driven_run().audit
     change = audit.work + audit.drive_work - audit.dissipated
     leak = np.diff(audit.energy) - change[1:]
@@ -150,7 +150,7 @@ def test_multipliers_stand_in_the_order_of_joints_then_drives():
 
 
 @pytest.mark.slow
-def test_a_top_on_a_lift_feels_what_its_inertia_feels():
+def test_a_top_on_a_lift_moves_like_one_with_an_inertial_force():
     """Driven at its joint, and at rest under the force that a lift's frame adds."""
     system, start, args = ej.problems.heavy_top()
     top: Any = system

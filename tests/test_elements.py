@@ -1,4 +1,4 @@
-"""Large systems as sums over elements: what is declared, and what is found."""
+"""Large systems as sums over elements, which are declared or found."""
 
 import jax.numpy as jnp
 import numpy as np

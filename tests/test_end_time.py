@@ -28,7 +28,7 @@ def whole_steps():
     return until("pendulum", ej.EnergyPreserving(), STEP, END, saveat=ej.SaveAt(every=1))
 
 
-def test_rows_at_the_ends_of_steps_are_these_bitwise():
+def test_rows_at_the_ends_of_steps_equal_the_steps_bitwise():
     system, start, args = problem("pendulum")
     run = ej.simulate(system, ej.EnergyPreserving(), start, args, h=STEP, num_steps=32)
     timed = whole_steps()
@@ -74,7 +74,7 @@ def test_steps_of_different_lengths_end_at_the_same_time():
     np.testing.assert_allclose(sol.ys.q[1, :33], whole_steps().ys.q, rtol=0, atol=1e-12)
 
 
-def test_a_decimal_length_takes_no_step_more():
+def test_a_decimal_step_length_takes_no_additional_step():
     # 0.3/0.1 is less than 3, 0.7/0.1 more than 7 - eps.
     for t1, count in ((0.3, 3), (0.7, 7), (0.72, 8)):
         every = ej.SaveAt(every=1)
@@ -109,14 +109,14 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_one_way_to_say_how_long(name):
+def test_the_length_of_a_run_is_given_in_one_way(name):
     options, message = BAD[name]
     system, start, args = problem("pendulum")
     with pytest.raises(ValueError, match=message):
         ej.simulate(system, ej.EnergyPreserving(), start, args, h=0.1, **options)
 
 
-def test_a_bound_is_asked_for_where_steps_are_traced():
+def test_traced_step_lengths_need_a_bound_on_the_steps():
     run = lambda h: until("pendulum", ej.EnergyPreserving(), h, END).ys.q
     with pytest.raises(ValueError, match="`max_steps` is missing"):
         jax.vmap(run)(jnp.array([0.01, 0.02]))

@@ -1,4 +1,4 @@
-"""Failures are values: reported where they happen, with all that came before intact."""
+"""Failures are values: they are reported where they happen, and earlier rows stay valid."""
 
 import jax
 import jax.numpy as jnp
@@ -69,7 +69,7 @@ def test_rows_before_a_failure_are_those_of_a_shorter_run(name, scheme, alpha, h
 @pytest.mark.slow
 @pytest.mark.parametrize("h", [0.02, 0.05])
 @pytest.mark.parametrize("alpha", [0.0, 0.5, 1.0])
-def test_kappa_ends_a_long_run_by_its_law_or_says_where_it_left_it(alpha, h):
+def test_kappa_keeps_its_law_in_a_long_run_or_reports_where_it_fails(alpha, h):
     """In 1e5 steps the kinetic energy comes close to a standstill many times."""
     steps = 100_000
     solution = solve("pendulum", "kappa", alpha, h=h, steps=steps)
@@ -179,7 +179,7 @@ def test_a_failed_lane_leaves_the_others_unchanged():
 
 
 def test_a_singular_step_is_a_failure_of_its_own():
-    """Two constraints that say the same leave their multipliers undetermined."""
+    """Two equal constraints leave their multipliers undetermined."""
 
     def twice(q, args):
         rod = q @ q - args["l"] ** 2

@@ -1,4 +1,4 @@
-"""A setting of the process: tried in processes of their own."""
+"""Fast loops are a setting of the process, so they are tested in separate processes."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""Forces that no potential has: order, exact work, and dampers that only damp."""
+"""Forces without a potential: order, exact work, and dampers that only remove energy."""
 
 import jax
 import jax.numpy as jnp
@@ -82,7 +82,7 @@ OMEGA = np.logspace(-3, 4, 15)
         ej.EnergyDecaying(1.0),
     ],
 )
-def test_a_damper_never_creates_energy_however_long_the_step(scheme):
+def test_a_damper_never_creates_energy_in_steps_of_any_length(scheme):
     """`h = 1` and frequencies from 1e-3 to 1e4; critical dampers and weak ones."""
     start = ej.State([1.0], [1.0])
 
@@ -129,7 +129,7 @@ def _pushed_and_braked(q, v, t, args):
     ],
     ids=lambda scheme: type(scheme).__name__,
 )
-def test_what_dampers_take_is_told_apart_from_the_work_of_other_forces(scheme, smooth):
+def test_the_energy_that_dampers_remove_is_reported_separately(scheme, smooth):
     system = ej.System(DAMPED.kinetic, DAMPED.potential, force=_pushed_and_braked)
     args = dict(k=4.0, c=0.8, dry=0.1, push=0.7, smooth=smooth)
     start = ej.State([1.0], [0.3])

@@ -1,4 +1,4 @@
-"""A short, fixed part of `benchmarks/fuzz.py`: what it tries at random has no findings."""
+"""A short, fixed part of `benchmarks/fuzz.py`, which must have no findings."""
 
 import fuzz
 import fuzz_functions
@@ -50,7 +50,7 @@ def test_random_systems_keep_their_laws_and_converge(scheme, n, free):
         pytest.param("consistent", "net", marks=pytest.mark.slow),
     ],
 )
-def test_derivatives_agree_and_lanes_do_not_meet(scheme, family):
+def test_derivatives_agree_and_lanes_are_independent(scheme, family):
     programs = fuzz_gradients.Programs(scheme, family)
     no_findings(fuzz_gradients.check(rng(seed), programs, family) for seed in range(2))
 
@@ -73,8 +73,8 @@ def test_every_function_alone_has_its_identity(number):
     no_findings(case.result for case in done)
 
 
-def test_a_crash_is_a_finding_and_not_the_end(monkeypatch):
-    """What the checks would say of a library that is wrong."""
+def test_a_crash_is_a_finding_and_the_fuzzing_continues(monkeypatch):
+    """The checks would report an incorrect library."""
 
     def cases(rng, number):
         yield "fine", lambda: Result([], {})

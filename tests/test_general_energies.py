@@ -176,7 +176,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("system", "message"), BAD)
-def test_bad_energies_are_told(system, message):
+def test_bad_energies_raise_an_error(system, message):
     with pytest.raises(ValueError, match=message):
         ej.initial_state(system, [1.0, 2.0], [0.5, 0.1])
 

@@ -1,4 +1,4 @@
-"""Derivatives of a run: forward, reverse and by differences, with respect to everything."""
+"""Derivatives of a run with respect to all numbers: forward, reverse and by differences."""
 
 import jax
 import jax.numpy as jnp
@@ -96,7 +96,7 @@ def tip(g, steps, save_every):
     "cut", long([(100, False), (101, False), (103, True)], (100, False), (101, False))
 )
 def test_saving_less_does_not_change_the_gradient(cut, monkeypatch):
-    """What the reverse pass computes again is what the run computed."""
+    """The reverse pass recomputes exactly the values of the run."""
     steps, is_long = cut
     monkeypatch.setattr(reverse_pass, "LONG", 10 if is_long else reverse_pass.LONG)
     forward = jax.jit(lambda g: jax.jvp(lambda g: tip(g, steps, 1), (g,), (1.0,))[1])(9.81)
@@ -235,7 +235,7 @@ def test_numbers_that_the_functions_close_over_count():
 
 
 def test_derivatives_of_a_free_oscillator():
-    """Without constraints: what belongs to them is empty, in derivatives too."""
+    """Without constraints all arrays of constraints are empty, in derivatives too."""
     kinetic = lambda v, args: 0.5 * args["m"] * v @ v
     system = ej.System(kinetic, lambda q, args: 4.5 * q @ q)
     start, t, w = ej.State(jnp.ones(1), jnp.zeros(1)), 0.2, 3.0

@@ -1,4 +1,4 @@
-"""Steps that fail are done in 2, 4, 8 parts; everything else is as in a whole step."""
+"""Failed steps are divided into 2, 4, 8 steps, with the properties of a whole step."""
 
 import functools
 
@@ -35,7 +35,7 @@ def batch():
     return jax.jit(jax.vmap(run))(jnp.asarray(STEPS))
 
 
-def test_a_step_that_turns_a_link_over_fails_and_says_so():
+def test_a_step_that_turns_a_link_over_reports_a_failure():
     solution = run(0.5, max_halvings=0)
     assert solution.result == ej.RESULTS.step_too_large
     assert np.all(np.asarray(solution.stats.halvings) == 0)
@@ -46,7 +46,7 @@ def test_a_step_that_turns_a_link_over_fails_and_says_so():
 
 
 @pytest.mark.slow
-def test_it_is_done_in_parts_that_keep_energy_and_constraints():
+def test_a_divided_step_keeps_energy_and_constraints():
     solution = batch()
     assert np.all(np.asarray(solution.result == ej.RESULTS.successful))
     assert np.max(solution.stats.halvings[1]) > 0
@@ -66,7 +66,7 @@ def test_lanes_are_halved_on_their_own(lane):
 
 
 @pytest.mark.slow
-def test_a_step_in_two_parts_is_two_steps():
+def test_a_step_that_is_halved_once_equals_two_steps():
     solution = run(0.5)
     halved = int(np.argmax(solution.stats.halvings))
     assert solution.stats.halvings[halved] == 1
@@ -79,7 +79,7 @@ def test_a_step_in_two_parts_is_two_steps():
 
 
 @pytest.mark.slow
-def test_derivatives_run_through_the_parts():
+def test_derivatives_pass_through_divided_steps():
     last = lambda h: run(h).ys.q[-1, 0]
     slope, step = float(jax.grad(last)(0.5)), 1e-6
     difference = float(last(0.5 + step) - last(0.5 - step)) / (2 * step)
@@ -88,7 +88,7 @@ def test_derivatives_run_through_the_parts():
 
 
 @pytest.mark.slow
-def test_a_damped_driven_step_keeps_its_balance_in_parts():
+def test_a_divided_step_with_damper_and_drive_keeps_its_balance():
     """Time passes through the parts, and work adds up over them."""
 
     def on_moving_pivot(q, t, args):

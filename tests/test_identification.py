@@ -1,4 +1,4 @@
-"""Fits: estimates, their uncertainty, and what the data cannot tell."""
+"""Fits: estimates, their uncertainty, and undetermined parameters."""
 
 import equinox as eqx
 import jax
@@ -63,7 +63,7 @@ def test_estimate_and_covariance_of_an_independent_program():
     assert [row.split()[0] for row in table[1:4]] == ["a", "offset", "rate"]
 
 
-def test_intervals_hold_what_they_promise():
+def test_confidence_intervals_contain_the_truth_as_often_as_they_claim():
     """Of 400 intervals of 95 % about 380 +- 4.4 hold the truth; five deviations."""
     fit = lambda data: ej.fit(decay_residuals, GUESS, data, positive=POSITIVE, throw=False)
     fits = eqx.filter_jit(jax.vmap(fit))(noisy(400))
@@ -73,7 +73,7 @@ def test_intervals_hold_what_they_promise():
         assert 358 <= held <= 400, (name, held)
 
 
-def test_minimisers_find_the_same():
+def test_minimisers_find_the_same_estimate():
     (data,) = noisy(1)
     best = ej.fit(decay_residuals, GUESS, data, positive=POSITIVE)
     solver = optx.BFGS(rtol=1e-9, atol=1e-9)
@@ -84,7 +84,7 @@ def test_minimisers_find_the_same():
     assert other.simulations == 2 * other.iterations + 4
 
 
-def test_what_the_data_does_not_tell_is_told():
+def test_undetermined_parameters_are_named():
     redundant = lambda p, data: p["a"] * p["b"] * jnp.exp(-p["rate"] * TIMES) - data
     data = 2 * np.exp(-TIMES) + 0.01 * np.random.default_rng(0).normal(size=TIMES.size)
     guess = {"a": 1.0, "b": 1.0, "rate": 0.5, "unused": 1.0}
@@ -133,7 +133,7 @@ def test_bad_input(guess, options, message):
         ej.fit(decay_residuals, guess, data, **options)
 
 
-def test_a_solver_that_fails_says_so():
+def test_a_failed_solver_raises_an_error():
     (data,) = noisy(1)
     with pytest.raises(eqx.EquinoxRuntimeError, match="failed after 2 iterations. The max"):
         ej.fit(decay_residuals, GUESS, data, max_steps=2)

@@ -1,4 +1,4 @@
-"""Starts: the smallest correction, and what is in balance there."""
+"""Consistent starts: the smallest correction, accelerations and multipliers."""
 
 import equinox as eqx
 import jax
@@ -148,7 +148,7 @@ def test_derivatives_with_respect_to_args_follow_the_rod():
     ("q", "residual"), [([0.5, 0.0], "-0.75"), ([0.0, 0.1], "-0.99"), ([0.3, 0.4], "-0.75")]
 )
 def test_a_start_too_far_away_raises_and_names_the_residual(q, residual):
-    """Near the pivot the direction of the rod is anybody's guess."""
+    """Near the pivot the direction of the rod is not determined."""
     system, _, args = problem("pendulum")
     with pytest.raises(ValueError, match="too far") as caught:
         ej.initial_state(system, q, [0.0, 0.0], args)
@@ -171,15 +171,15 @@ def test_constraints_that_repeat_each_other_raise_and_name_their_rank():
         ej.initial_state(system, start.q, start.v, args)
 
 
-def test_integers_and_lists_are_taken_for_vectors():
+def test_integers_and_lists_are_accepted_as_vectors():
     system, start, args = problem("pendulum")
     same = ej.initial_state(system, [1, 0], (0, 0), args)
     np.testing.assert_array_equal(same.q, start.q)
     assert same.v.dtype == start.v.dtype
 
 
-def test_a_light_slow_body_beside_a_heavy_fast_one():
-    """Each unknown is judged by itself: the pendulum holds its rod all the same."""
+def test_a_light_slow_body_is_projected_as_accurately_as_a_heavy_fast_one():
+    """The tolerance applies to each unknown, so the pendulum keeps its rod."""
 
     def kinetic(v, args):
         return 0.5e-6 * v[:2] @ v[:2] + 0.5e6 * v[2] ** 2
@@ -223,7 +223,7 @@ def test_known_entries_stay_and_the_rest_follows():
     assert by_x == pytest.approx(-0.75, rel=1e-12)  # solver
 
 
-def test_too_much_that_is_known_is_told():
+def test_too_many_known_entries_raise_an_error():
     system, _, args = problem("pendulum")
     with pytest.raises(ValueError, match="too many entries are known"):
         ej.initial_state(system, [0.9, 0.1], [0.0, 0.0], args, known_q=[0, 1])
@@ -233,7 +233,7 @@ def test_too_much_that_is_known_is_told():
         ej.initial_state(system, [0.6, 0.8], [1.0, 0.0], args, known_v=[2])
 
 
-def test_a_lane_without_a_start_leaves_the_others_alone():
+def test_a_lane_without_a_start_does_not_affect_the_others():
     system, _, args = problem("pendulum")
     guesses = jnp.array([[1.0, 0.1], [9.0, 0.0], [0.3, 0.9]])
     make = lambda q: ej.initial_state(system, q, jnp.zeros(2), args, throw=False)

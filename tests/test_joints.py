@@ -1,4 +1,4 @@
-"""Every joint between two bodies in free flight, and holding one still against gravity."""
+"""Every joint, between two bodies in free flight, and holding one against gravity."""
 
 import functools
 
@@ -67,7 +67,7 @@ def on_ground(name):
 
 
 @pytest.mark.parametrize("name", JOINTS)
-def test_a_joint_leaves_its_own_freedom_and_carries_the_rest(name):
+def test_a_joint_leaves_its_degrees_of_freedom_and_carries_all_other_loads(name):
     scene, motions = on_ground(name), JOINTS[name][1]
     system, q, args = scene.system, scene.q, scene.args
     assert system.constraint is not None

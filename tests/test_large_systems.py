@@ -1,4 +1,4 @@
-"""Systems of many unknowns: the pattern of the Jacobian, the band, what runs on them."""
+"""Systems of many unknowns: the pattern of the Jacobian, band solvers, and runs."""
 
 import functools
 
@@ -72,7 +72,7 @@ def test_the_pattern_covers_the_jacobian(name):
         np.testing.assert_array_equal(jacobian, pattern)
 
 
-def test_a_pattern_that_is_too_full_is_none(monkeypatch):
+def test_a_pattern_that_is_too_dense_is_none(monkeypatch):
     """A system of such functions runs all the same, densely."""
     monkeypatch.setattr("enerjax._programs.sparsity.pattern._MAX_ENTRIES", 1000)
     size = 40
@@ -185,7 +185,7 @@ def test_derivatives_of_a_chain():
 
 
 @pytest.mark.slow
-def test_lanes_of_chains_move_alone():
+def test_lanes_of_chains_are_independent():
     system, start, args = ej.problems.chain(NUM_LINKS)
     run = eqx.filter_jit(
         lambda g: ej.simulate(
@@ -214,7 +214,7 @@ def test_repeated_constraints_of_a_large_system_are_reported():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("num_links", [64, 512])
-def test_the_whip(num_links):
+def test_a_chain_that_cracks_like_a_whip_keeps_energy_and_constraints(num_links):
     """At the whip of the longer chain some steps have to be divided."""
     system, start, args = ej.problems.chain(num_links)
     run = ej.simulate(

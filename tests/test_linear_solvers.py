@@ -11,7 +11,7 @@ import enerjax as ej
 @pytest.mark.parametrize(
     "solver", [*(pytest.param(x, marks=pytest.mark.slow) for x in ("LU", "QR")), "KLU"]
 )
-def test_a_given_linear_solver_is_used(solver):
+def test_the_linear_solver_of_the_user_is_used(solver):
     """The same motion and derivatives, whoever solves the linear systems."""
     if solver == "KLU":
         pytest.importorskip("klujax")
@@ -42,6 +42,6 @@ def test_a_given_linear_solver_is_used(solver):
     assert pulled == pytest.approx(float(rate[-1]), rel=1e-9)  # solver
 
 
-def test_a_wrong_linear_solver_is_told():
+def test_a_wrong_linear_solver_raises_an_error():
     with pytest.raises(TypeError, match="solver of lineax"):
         ej.Newton(linear_solver=np.linalg.solve)  # pyright: ignore

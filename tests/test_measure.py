@@ -1,4 +1,4 @@
-"""Comparisons of schemes: errors, orders, what is refused, and the model for diffrax."""
+"""Comparisons of schemes: errors, orders, refusals, and the model for diffrax."""
 
 import functools
 import sys
@@ -44,7 +44,7 @@ def test_orders_of_the_pendulum():
     np.testing.assert_allclose(table.order_multipliers, 1, atol=0.1)
 
 
-def test_the_extrapolated_reference_is_as_good_as_given_data():
+def test_the_extrapolated_reference_is_as_good_as_exact_data():
     table, given = orders(), against_data()
     assert max(table.uncertainty["q"], table.uncertainty["v"]) <= 1e-10
     # Both know the motion to 1e-10, against errors of 4e-4.
@@ -54,7 +54,7 @@ def test_the_extrapolated_reference_is_as_good_as_given_data():
     assert given.uncertainty == dict(q=0.0, v=0.0, multipliers=0.0)
 
 
-def test_what_a_comparison_reports():
+def test_a_comparison_reports_errors_and_costs():
     given = against_data()
     for name in ("q", "v", "multipliers", "evaluations", "seconds"):
         assert getattr(given, name).shape == (2, 2)
@@ -70,7 +70,7 @@ def test_what_a_comparison_reports():
     assert "2.0" in str(orders())
 
 
-def test_pictures():
+def test_the_results_can_be_plotted():
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
@@ -80,7 +80,7 @@ def test_pictures():
         plt.close(figure)
 
 
-def test_failures_are_rows():
+def test_a_failed_run_has_a_row_with_the_reason():
     system, start, args = problem("double")
     schemes = {"kappa": ej.KappaDecaying(0.5), "good": ej.EnergyPreserving()}
     end = double_pendulum_reference(2.0)
@@ -95,7 +95,7 @@ def test_failures_are_rows():
     assert comparison.failures[0][0] in str(comparison)
 
 
-def test_refusals_are_rows():
+def test_a_refused_system_has_a_row_with_the_reason():
     system, start, args = problem("top")
     data = (0.1, np.concatenate([HEAVY_TOP[0.1].position, HEAVY_TOP[0.1].quaternion]))
     table = ej.order_table(

@@ -94,7 +94,7 @@ def test_points_keep_their_momenta(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FREE)
-def test_points_keep_their_momenta_in_long_runs(name):
+def test_points_conserve_their_momenta_in_long_runs(name):
     # Round-off, a random walk. The particles end 250 lengths away from where they began,
     # and their moment of momentum is rounded that much more.
     _check_points(name, 100_000, 4e-11 if name == "particles" else 1e-11)
@@ -125,7 +125,7 @@ def _top(name, h, steps=200, save_every=1):
 
 
 @pytest.mark.parametrize("name", long(TOPS, "top", "top canonical"))
-def test_tops_keep_energy_and_what_their_coordinates_show(name):
+def test_tops_conserve_energy_and_the_visible_momenta(name):
     run, vertical, spin = _top(name, 1e-3)
     coarse, coarse_vertical, coarse_spin = _top(name, 2e-3, 100)
     position = TOPS[name][1](run.ys.q[-1])
@@ -144,7 +144,7 @@ def test_tops_keep_energy_and_what_their_coordinates_show(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TOPS)
-def test_tops_keep_them_in_long_runs(name):
+def test_tops_conserve_energy_and_momenta_in_long_runs(name):
     run, vertical, _ = _top(name, 1e-3, 100_000, 1000)
     assert _drift(run.audit.energy) <= 1e-11
     if name != "top":
@@ -169,7 +169,7 @@ def test_angles_keep_the_energy_in_long_runs():
 
 
 @pytest.mark.slow
-def test_the_canonical_top_with_the_flagship():
+def test_the_canonical_top_with_energy_consistent():
     system, start, args = problem("top canonical")
     errors = []
     for h, bound in ((2e-3, 1e-4), (1e-3, 6e-6)):

@@ -1,4 +1,4 @@
-"""Whole steps as one function of machine code: where, and that it changes no value."""
+"""Whole steps as one function of machine code, with the same values."""
 
 import functools
 
@@ -157,7 +157,7 @@ def test_operations_that_are_possible(group):
         np.testing.assert_allclose(a, b, rtol=4e-15, atol=4e-15)
 
 
-def test_each_operation_that_is_called_possible_is_tried():
+def test_every_possible_operation_is_tested():
     tried = {name for f in GROUPS for name in names(jax.make_jaxpr(f)(X, K).jaxpr)}
     assert possible.POSSIBLE | possible.POSSIBLE_IF_SMALL <= tried
 
@@ -174,7 +174,7 @@ NOT_POSSIBLE = {
 
 
 @pytest.mark.parametrize("name", NOT_POSSIBLE)
-def test_what_is_not_possible_is_left_as_it_is(name):
+def test_impossible_operations_are_compiled_as_usual(name):
     fn = NOT_POSSIBLE[name]
     left = in_one_function(fn)
     assert not is_marked(left, X)

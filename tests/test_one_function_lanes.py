@@ -1,4 +1,4 @@
-"""Lanes and derivatives of what is one function of machine code, and of both together."""
+"""Lanes and derivatives of programs that are one function of machine code."""
 
 import jax
 import jax.numpy as jnp
@@ -124,7 +124,7 @@ def weighed(fn):
 
 
 def lanes_by_hand(fn, axes):
-    """What `vmap` means."""
+    """The definition of `vmap`, as a loop."""
 
     def call(x, y):
         of_lane = lambda a, axis, k: a if axis is None else a[k]
@@ -159,7 +159,7 @@ def test_derivatives_of_batches(name, axes, jit):
     jax.tree.map(close, found, expected)
 
 
-def test_inputs_that_turn_out_to_be_constant():
+def test_inputs_that_become_constants_are_passed_as_inputs():
     """XLA must not put them inside: inputs that are not used end the process."""
     # The sort keeps the step from being one function; the search for the start is one.
     potential = lambda q, a: 9.81 * q[1] + 1e-3 * jnp.sum(jnp.sort(q) ** 2)
@@ -178,7 +178,7 @@ def test_inputs_that_turn_out_to_be_constant():
 
 
 def in_loops(jaxpr, inside=False):
-    """What loops consist of, outside of what is one function."""
+    """The primitives of loops outside of programs that are one function."""
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
         if inside:
@@ -203,7 +203,7 @@ def test_runs_of_small_systems_are_one_function():
 
 
 @pytest.mark.slow
-def test_without_compiling_and_where_nans_are_looked_for():
+def test_disable_jit_and_debug_nans_work():
     system, start, args = ej.problems.pendulum()
     step = lambda: ej.step(system, ej.EnergyPreserving(), start, args, h=0.01).state.q
     with jax.disable_jit():
@@ -226,7 +226,7 @@ def test_numbers_of_other_kinds():
     assert isinstance(in_one_function(lambda x: x)(2.0), jax.Array)
 
 
-def test_nothing_outlives_its_trace():
+def test_no_tracer_outlives_its_trace():
     @jax.jit
     def closes_over(x, a):
         return in_one_function(lambda y: jnp.sin(a * y))(x)

@@ -122,7 +122,7 @@ def test_error_on_the_double_pendulum(scheme, alpha, steps, bound):
     assert q[0] <= bound
 
 
-def test_schemes_know_their_order():
+def test_schemes_state_their_order():
     expected = {
         "preserving": 2,
         "decaying": 2,

@@ -1,4 +1,4 @@
-"""What `print` shows, and what looks as if it could be assigned to."""
+"""The texts of `print`, and read-only mappings of numbers."""
 
 import jax
 import jax.numpy as jnp
@@ -58,7 +58,7 @@ def test_numbers_of_a_scene_are_printed_by_name(pendulum):
     assert "bob: mass = float64[]" in shown[0]
 
 
-def test_a_run_prints_outcome_steps_iterations_and_account():
+def test_a_run_prints_outcome_steps_iterations_and_audit():
     problem = ej.problems.stiff_double_pendulum()
     good = str(run(problem, 1e-3))
     assert good.splitlines()[0] == "successful"
@@ -72,7 +72,7 @@ def test_a_run_prints_outcome_steps_iterations_and_account():
     assert "steps divided, into up to" in divided
 
 
-def test_a_batch_prints_how_many_ended_how():
+def test_a_batch_prints_the_number_of_lanes_with_each_outcome():
     problem = ej.problems.pendulum()
     batch = jax.vmap(lambda h: run(problem, h))(jnp.array([0.01, 0.02, 50.0]))
     lines = str(batch).splitlines()
@@ -82,7 +82,7 @@ def test_a_batch_prints_how_many_ended_how():
     assert str(ej.RESULTS.successful) == "enerjax._results.RESULTS<successful>"
 
 
-def test_a_mobility_prints_its_findings():
+def test_a_mobility_prints_its_results():
     system = ej.System(
         lambda v, args: 0.5 * v @ v,
         lambda q, args: 0.0 * q[0],

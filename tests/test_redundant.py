@@ -1,4 +1,4 @@
-"""Over-constrained mechanisms: multipliers of least norm, the motion of the rest."""
+"""Over-constrained mechanisms: multipliers of least norm, and their motion."""
 
 import functools
 
@@ -73,7 +73,7 @@ def _exact():
     return np.concatenate([up, up + [2, 0]])
 
 
-def test_without_being_declared_they_are_refused():
+def test_undeclared_redundant_constraints_are_refused():
     system, args = _beam(3, redundant=False)
     with pytest.raises(ValueError, match="redundant=True"):
         _start(system, args)

@@ -1,4 +1,4 @@
-"""What XLA cannot do inside of one function, said in other words: the same values."""
+"""Programs are rewritten so that they can be one function, with the same values."""
 
 import jax
 import jax.numpy as jnp
@@ -68,7 +68,7 @@ IN_OTHER_WORDS = {
 
 
 @pytest.mark.parametrize("name", IN_OTHER_WORDS)
-def test_values_and_derivatives(name):
+def test_rewritten_programs_have_the_same_values_and_derivatives(name):
     fn = IN_OTHER_WORDS[name]
     other = in_one_function(fn)
     assert is_marked(other, X)

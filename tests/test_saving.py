@@ -1,4 +1,4 @@
-"""Which states a run saves: every so many steps, requested times, a function of them."""
+"""Which states a run saves: every few steps, at requested times, or a function of them."""
 
 import functools
 from typing import Any
@@ -110,12 +110,12 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_bad_choices(name):
+def test_contradictory_choices_are_refused(name):
     options, kind, message = BAD[name]
     with pytest.raises(kind, match=message):
         ej.SaveAt(**options)
 
 
-def test_something_else_than_a_choice():
+def test_anything_but_a_save_at_is_refused():
     with pytest.raises(TypeError, match="`saveat` must be a `SaveAt`"):
         run([0.0, 1.0])

@@ -39,7 +39,7 @@ OMEGA = np.logspace(-3, 4, 8)
         pytest.param(ej.EnergyDecaying(1.0), marks=pytest.mark.slow),
     ],
 )
-def test_a_torsion_damper_never_creates_energy_however_long_the_step(scheme):
+def test_a_torsion_damper_never_creates_energy_in_steps_of_any_length(scheme):
     """`h = 1` and frequencies from 1e-3 to 1e4; critical dampers and weak ones."""
     system, start, args = wheel().build()
 
@@ -77,7 +77,7 @@ def damped_pendulum(damping):
         pytest.param(ej.EnergyConsistent(0.5), marks=pytest.mark.slow),
     ],
 )
-def test_a_damper_that_turns_takes_energy_out_in_every_step(scheme):
+def test_a_turning_damper_removes_energy_in_every_step(scheme):
     system, start, args = damped_pendulum(1.0).build()
 
     def run(h, damping):
@@ -91,7 +91,7 @@ def test_a_damper_that_turns_takes_energy_out_in_every_step(scheme):
     assert np.max(most) <= 0
 
 
-def test_dampers_have_the_power_that_they_say():
+def test_dampers_have_the_stated_power():
     system, start, args = damped_pendulum(2.0).build()
     v = ej.initial_state(system, start.q, [0, 0.5, 1, 1, 0, -2], args).v
     assert system.force is not None
@@ -135,7 +135,7 @@ def test_a_hinge_with_a_damper_in_space_slows_down_exponentially(body):
 
 
 def pushed():
-    """Four bodies that know nothing of each other, each with a force of its own."""
+    """Four independent bodies, each with its own force."""
     swing = lambda t, args: args["force"] * jnp.sin(3 * t)
     vector = lambda t, args: jnp.stack([0 * t, args["force"] * t])
     return ej.Scene(
@@ -153,7 +153,7 @@ def pushed():
     )
 
 
-def test_forces_that_a_program_gives_follow_their_closed_forms():
+def test_forces_that_functions_define_follow_closed_forms():
     scene = pushed()
     system, start, args = scene.build()
     run = on_host(

@@ -1,4 +1,4 @@
-"""Servos, and what parts of scenes measure, against minimal coordinates and by hand."""
+"""Servos and measures of parts, against minimal coordinates and by hand."""
 
 import functools
 import inspect
@@ -131,7 +131,7 @@ def points():
     )
 
 
-def test_lengths_and_forces_are_those_by_hand():
+def test_lengths_and_forces_equal_those_computed_by_hand():
     scene = points()
     start = scene.start()
     near = functools.partial(np.testing.assert_allclose, rtol=1e-13, atol=1e-13)
@@ -174,7 +174,7 @@ def test_a_law_of_another_signature_is_refused_by_its_name():
 
 
 @pytest.mark.parametrize("module", [ej.bodies, ej.joints, ej.forces, ej.drives])
-def test_modules_of_parts_show_parts_alone(module):
+def test_modules_of_parts_list_only_parts(module):
     assert dir(module)
     for name in dir(module):
         part = getattr(module, name)

@@ -1,4 +1,4 @@
-"""Starts of scenes: what is told is kept, the rest follows; what cannot be is refused."""
+"""Starts of scenes: prescribed velocities are kept, the others follow from the joints."""
 
 import jax
 import jax.numpy as jnp
@@ -43,7 +43,7 @@ def four_bar(off):
     )
 
 
-def test_velocities_that_are_left_out_follow_from_those_given():
+def test_velocities_that_are_left_out_follow_from_the_others():
     """A crank that is told to turn turns so, and takes the other bars along."""
     for off in (0.0, 1e-3):
         scene = four_bar(off)
@@ -60,7 +60,7 @@ def pendulum(velocity, spin):
     return ej.Scene([rod, Revolute("pin", "ground", "rod", [0.0, 0.0])])
 
 
-def test_velocities_that_no_joint_allows_are_refused():
+def test_velocities_that_joints_do_not_admit_are_refused():
     with pytest.raises(ValueError, match="do not fit 'pin'.*grow at 2"):
         pendulum([0.0, 3.0], 2.0).start()
     # Rounded to two digits, they are repaired, by the least kinetic energy.
@@ -104,7 +104,7 @@ def test_an_axis_is_common_along_a_shaft_of_several_hinges():
     assert "shaft" in str(ej.Scene([*parts, shaft]))
 
 
-def test_reports_are_of_the_time_and_the_numbers_that_are_asked_for():
+def test_reports_use_the_requested_time_and_numbers():
     bead = Point("bead", 1.0, [1.0, 0.0])
     ram = ej.drives.Distance("ram", "ground", "bead", lambda t, args: args["l"] + t)
     scene = ej.Scene([bead, ram], args=dict(l=1.0))

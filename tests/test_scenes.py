@@ -1,4 +1,4 @@
-"""Scenes: what they compile to, what they refuse, and the mechanisms made of them."""
+"""Scenes: their systems, their parameters, and their gaps."""
 
 import functools
 
@@ -149,7 +149,7 @@ def test_large_scenes_are_sparse():
     assert np.max(np.abs(rows / 2 - columns / 3)) < 2  # of a body and the one before
 
 
-def test_what_is_off_a_little_is_reported_and_closed():
+def test_a_small_gap_is_reported_and_closed():
     parts = [
         Rod("rod", 1.0, [0.0, 0.0], [1.0, 0.0]),
         Revolute("pin", "ground", "rod", [0.0, 0.003], [-0.5, 0.004]),
@@ -169,7 +169,7 @@ def test_what_is_off_a_little_is_reported_and_closed():
     assert max(gap) <= 1e-14  # round-off
 
 
-def test_forces_have_the_energies_that_they_say():
+def test_forces_have_the_stated_energies():
     angle = 0.3
     turned = ej.bodies.PlanarBody("arm", 2.0, 0.1, [0.0, 0.0], angle)
     scene = ej.Scene(
@@ -214,7 +214,7 @@ def test_constraints_of_your_own_stand_beside_joints():
     assert "1 degree of freedom" in str(scene)
 
 
-def test_a_scene_is_told_in_words():
+def test_printing_a_scene_lists_its_parts():
     words = str(double_pendulum()[0])
     for part in (
         "plane",

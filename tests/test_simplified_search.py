@@ -1,4 +1,4 @@
-"""Large systems are searched with a simplified Jacobian; their solutions do not know it."""
+"""Newton's method uses a simplified Jacobian for large systems, with the same solutions."""
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +38,7 @@ def test_a_band_is_cut_into_the_blocks_that_it_is_made_of():
 @pytest.mark.parametrize(
     ("scheme", "blocks"), [("preserving", (8, 4)), ("decaying", (16, 8))]
 )
-def test_what_is_simplified_of_a_chain_is_its_pattern(scheme, blocks):
+def test_the_simplified_jacobian_of_a_chain_has_its_pattern(scheme, blocks):
     """Links meet only their neighbours in it, and where nothing has moved it is exact."""
     system, start, args = ej.problems.chain(NUM_LINKS)
     assert isinstance(system, ej.System)
@@ -85,8 +85,8 @@ def _simplified_and_exact(equations):
 
 
 @pytest.mark.parametrize("strength", [1e-3, 0.3, 30.0])
-def test_a_root_and_its_derivatives_do_not_depend_on_what_was_left_out(strength):
-    """Neither where it is weak, nor where the search fails without it."""
+def test_a_root_and_its_derivatives_do_not_depend_on_the_simplification(strength):
+    """Neither if the neglected coupling is weak, nor if the search fails without it."""
     simplified, exact = _equations(strength)
     args = jnp.cos(jnp.arange(float(SIZE)))
 
@@ -103,8 +103,8 @@ def test_a_root_and_its_derivatives_do_not_depend_on_what_was_left_out(strength)
     np.testing.assert_allclose(change, np.linalg.solve(jacobian, args), rtol=1e-9)
 
 
-def test_the_search_alone_is_simplified():
-    """One correction with the simplified Jacobian leaves what that leaves out."""
+def test_only_the_search_uses_the_simplified_jacobian():
+    """One correction with the simplified Jacobian leaves an error."""
     simplified, exact = _equations(0.3)
     args = jnp.cos(jnp.arange(float(SIZE)))
     count = lambda **kind: jax.jit(
@@ -117,7 +117,7 @@ def test_the_search_alone_is_simplified():
     assert count(jacobian_of=simplified) > count()
 
 
-def test_lanes_that_need_the_exact_jacobian_move_alone():
+def test_lanes_that_need_the_exact_jacobian_do_not_affect_others():
     args = jnp.cos(jnp.arange(float(SIZE)))
 
     def root(strength):

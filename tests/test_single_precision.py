@@ -1,4 +1,4 @@
-"""In float32 all that holds to round-off holds to that of float32."""
+"""Properties that hold to round-off hold to that of float32."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""The step on its own, and what a run makes of it."""
+"""The function `step`, and its relation to a run."""
 
 from typing import Any
 
@@ -48,7 +48,7 @@ def test_a_loop_over_step_is_a_run(scheme):
     np.testing.assert_allclose(first.state.q, run.ys.q[1], **SAME)
 
 
-def test_memory_of_the_steps_before_saves_iterations_and_changes_nothing():
+def test_the_memory_of_earlier_steps_saves_iterations_and_changes_no_result():
     system, start, args = problem("pendulum")
     scheme = SCHEMES["preserving"](0.0)
     warm, spent = None, [0, 0]
@@ -66,7 +66,7 @@ def test_memory_of_the_steps_before_saves_iterations_and_changes_nothing():
 
 
 @pytest.mark.parametrize("save_every", [5, 100])
-def test_saving_less_is_thinning(save_every):
+def test_saving_less_selects_rows(save_every):
     full = solve("pendulum", "decaying", 0.5, h=H, steps=STEPS)
     thin = solve("pendulum", "decaying", 0.5, h=H, steps=STEPS, save_every=save_every)
     np.testing.assert_allclose(thin.ys.q, full.ys.q[::save_every], **SAME)
@@ -137,7 +137,7 @@ def test_symmetric_schemes_go_back_the_way_they_came(scheme):
     assert error <= 1e-12
 
 
-def test_dissipation_has_no_way_back():
+def test_a_dissipative_step_is_not_reversible():
     error, _ = there_and_back("decaying", 1.0)
     assert error > 1e-8
 
@@ -171,7 +171,7 @@ def test_a_composition_is_its_stages_one_after_the_other():
 
 
 @pytest.mark.parametrize("name", ["Newton", "Chord", "Dogleg", "LevenbergMarquardt"])
-def test_another_root_finder_can_be_given(name):
+def test_another_root_finder_can_be_used(name):
     """The step equations are scaled, so a plain tolerance of a library does."""
     system, start, args = problem("pendulum")
     run = ej.simulate(

@@ -1,4 +1,4 @@
-"""Sweeps: every lane in its place, whatever computes it, and found by its parameters."""
+"""Sweeps: the order of lanes, and selection by parameters."""
 
 import functools
 import sys
@@ -66,7 +66,7 @@ def test_a_lane_is_its_run_alone():
 
 
 def test_lanes_that_take_their_steps_together_are_alike():
-    """In a batch as many steps are taken as its longest lane asks for."""
+    """A batch takes as many steps as its longest lane needs."""
 
     def counted(h):
         steps = lambda n: jax.lax.while_loop(lambda k: k < n, lambda k: k + 1, 0)
@@ -90,7 +90,7 @@ def test_parameters_that_change_together():
         found.at(a=2.0)
 
 
-def test_parameters_that_are_trees():
+def test_parameters_can_be_pytrees():
     starts = {"q": np.arange(6.0).reshape(3, 2), "t": np.arange(3.0)}
 
     def fn(start, scale):
@@ -169,7 +169,7 @@ def test_selection_by_value():
         sums().smallest("both")
 
 
-def test_the_smallest_passes_over_failures():
+def test_smallest_ignores_failed_lanes():
     found = ej.sweep(lambda a: jnp.log(a), {"a": [-1.0, 2.0, 1.0]})
     assert found.smallest("value").parameters == dict(a=1.0)
     with pytest.raises(ValueError, match="NaN in all lanes"):

@@ -27,7 +27,7 @@ def counting(calls):
     return progress
 
 
-def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
+def test_finished_chunks_are_not_repeated(tmp_path, monkeypatch):
     over = {"a": np.arange(6.0), "b": [1.0]}
     first = ej.sweep(arithmetic, over, chunk=2, path=tmp_path)
     (tmp_path / "chunk-000001.npz").unlink()
@@ -77,7 +77,7 @@ def stepped(scheme, newton):
     return step
 
 
-def test_settings_that_no_shape_tells_make_another_sweep(tmp_path):
+def test_settings_that_change_no_shape_make_another_sweep(tmp_path):
     """Of the discrete derivative, its points, and Newton's tolerances."""
     over, newton = {"h": [0.1]}, ej.Newton()
     scheme = lambda derivative: ej.EnergyPreserving(derivative=derivative)
@@ -152,7 +152,7 @@ def compare(file):
             np.testing.assert_allclose(found[name], expected, rtol=0, atol=1e-12)
 
 
-def test_a_killed_sweep_goes_on_on_other_devices(tmp_path):
+def test_a_killed_sweep_is_resumed_on_other_devices(tmp_path):
     folder, result = tmp_path / "sweep", tmp_path / "result.npz"
     killed = process(result, "--path", folder, "--die-after", 16)
     killed.communicate(timeout=300)
@@ -166,7 +166,7 @@ def test_a_killed_sweep_goes_on_on_other_devices(tmp_path):
     compare(result)
 
 
-def test_two_processes_find_what_one_finds(tmp_path):
+def test_two_processes_find_the_same_results_as_one(tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -181,8 +181,8 @@ def test_two_processes_find_what_one_finds(tmp_path):
     assert len(list(folder.glob("chunk-*.npz"))) == 4
 
 
-def test_drafts_are_no_results(tmp_path):
-    """What a process leaves that is killed while it writes."""
+def test_drafts_are_not_read_as_results(tmp_path):
+    """A draft is the file of a process that was killed while it wrote."""
     old, new = (tmp_path / f".chunk-000000.npz.{k}" for k in range(2))
     for draft in (old, new):
         draft.write_bytes(b"half")

@@ -1,4 +1,4 @@
-"""What depends on time can be differentiated and batched; what does not pays nothing."""
+"""Time-dependent systems can be differentiated and batched; others have no time."""
 
 import jax
 import jax.numpy as jnp
@@ -80,7 +80,7 @@ def test_without_force_and_drive_there_is_no_time(scheme):
     assert depends(jaxpr, jaxpr.invars[0])
 
 
-def test_time_is_no_leaf_of_what_users_hold():
+def test_states_of_users_have_no_time():
     out = ej.step(
         DRIVEN_PENDULUM, SCHEMES["preserving"][0], driven_start(), ARGS, h=0.01, t=0.2
     )

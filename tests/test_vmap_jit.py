@@ -1,4 +1,4 @@
-"""Batches equal loops, and new numbers never compile anything."""
+"""Batches equal loops, and new numbers do not recompile."""
 
 import functools
 from typing import Any

@@ -1,4 +1,4 @@
-"""Case d of the paper: the whip of a light mass, beyond which Newton must find its way.
+"""Case d of the paper: a light mass that cracks like a whip, where Newton's method is hard.
 
 At h = 0.01 a step takes the light mass through a good part of a turn; for some steps
 Newton's method finds the solution from a shortened free flight alone, for some there is
@@ -47,7 +47,7 @@ def test_the_runs_of_figures_10_and_11_are_whole_and_undivided():
 
 
 @pytest.mark.slow
-def test_what_has_no_solution_is_divided_and_told():
+def test_a_step_without_a_solution_is_divided_and_reported():
     run = whip(ej.EnergyDecaying(0.0), 0.01, max_halvings=4)
     check(run, 0.01, 0.0)
     divided = np.count_nonzero(run.stats.halvings)

@@ -1,4 +1,4 @@
-"""Functions whose author gave their derivative, and what a selection does not choose."""
+"""Functions with a custom derivative, and selections with an undefined branch."""
 
 import jax
 import jax.numpy as jnp
@@ -64,7 +64,7 @@ def _outside_jvp(primals, tangents):
 
 
 @pytest.mark.parametrize("fn", [_norm, _table, _outside], ids=["norm", "table", "callback"])
-def test_the_derivative_that_was_given_is_used(fn):
+def test_a_custom_derivative_is_used(fn):
     a, b = jnp.array([0.0, 0.0]), jnp.array([0.3, -0.4])
     D = ej.discrete_grad(fn)
     # Round-off.
@@ -85,7 +85,7 @@ LOGS = (jnp.log, jnp.log1p, lambda x: jnp.log(x) + jnp.arctanh(x))
 
 
 @pytest.mark.parametrize("other", LOGS)
-def test_what_is_not_chosen_does_not_poison(other):
+def test_a_branch_that_is_not_chosen_does_not_spread_nan(other):
     fn = lambda q: jnp.where(q > -5, q**2, other(q))
     for a, b in ((-1.5, -1.2), (-3.0, -1.5), (-3.0, 3.0), (-2.0, -2.0), (2.0, 4.0)):
         assert ej.discrete_grad(fn)(a, b) == pytest.approx(a + b, abs=10 * EPS)
@@ -93,5 +93,5 @@ def test_what_is_not_chosen_does_not_poison(other):
         assert slope == pytest.approx(1, abs=10 * EPS)
 
 
-def test_what_is_chosen_where_it_is_not_defined_shows():
+def test_a_chosen_undefined_branch_is_nan():
     assert np.isnan(ej.discrete_grad(jnp.log)(-1.0, -0.9))

@@ -1,4 +1,4 @@
-"""What a run itself says of its accuracy: an estimate, by how velocities change."""
+"""The phase error: a run's own estimate of its accuracy."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_the_estimate_follows_the_error_of_an_oscillator(scheme):
     assert "phase of the motion, by local errors: to about" in str(unresolved)
 
 
-def test_a_success_of_the_wrong_motion_is_flagged():
+def test_an_unresolved_motion_has_a_large_phase_error():
     """A light mass that is whipped around, faster than the steps can follow: the balance
     holds, and the heavy mass is 0.98 of a length off."""
     system, start, args = ej.problems.double_pendulum(m1=1e-4, m2=1.0)
@@ -46,7 +46,7 @@ def test_a_success_of_the_wrong_motion_is_flagged():
     assert calm.phase_error < 1e-3
 
 
-def test_what_hangs_at_rest_has_no_phase_to_lose():
+def test_a_system_at_rest_has_no_phase_error():
     system, start, args = ej.problems.pendulum()
     hanging = ej.initial_state(system, [0.0, 1.0], [0.0, 0.0], args)
     run = ej.simulate(system, ej.EnergyPreserving(), hanging, args, h=0.05, num_steps=50)

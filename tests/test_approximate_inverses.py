@@ -22,8 +22,8 @@ def matrix(t):
 
 
 @pytest.mark.parametrize("off", [1e-6, 1e-3, 0.02, 0.2, 2.0])
-def test_renewed_from_near_and_from_far(off):
-    """By improvements, or computed afresh."""
+def test_an_inverse_is_improved_or_recomputed(off):
+    """Both by improvements and by a new inversion."""
     old = Inverse(jnp.linalg.inv(matrix(0.0)))
     new = jax.jit(lambda at: old.renewed(at))(matrix(off))
     left = np.asarray(matrix(off) @ new.inverse) / ROWS * ROWS.T - np.eye(SIZE)
@@ -37,7 +37,7 @@ def test_a_singular_matrix_has_no_inverse():
 
 
 @pytest.mark.parametrize(("brake", "load"), [(1e10, 1e-6), (1e10, 1e-13), (1e8, 1e-8)])
-def test_what_becomes_soft_is_seen(brake, load):
+def test_an_inverse_is_recomputed_when_an_equation_becomes_soft(brake, load):
     """A body whose brake is released: inverses of before do not see what is left of its
     equation, while the corrections of another body shrink as they should."""
 

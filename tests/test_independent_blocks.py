@@ -1,4 +1,4 @@
-"""Matrices that fall apart into blocks: the maps from rates to velocities."""
+"""Independent blocks of the maps from rates to velocities."""
 
 import jax
 import jax.numpy as jnp
@@ -72,12 +72,12 @@ def test_derivatives_of_solutions():
         )
 
 
-def test_a_matrix_in_one_piece_or_singular_has_no_parts():
+def test_a_connected_or_singular_matrix_has_no_blocks():
     assert parts_of(np.full((3, 3), np.nan)) is None
     assert parts_of(np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])) is None
 
 
-def test_zeros_that_hold_only_here_are_no_constants():
+def test_zeros_at_one_point_only_are_not_constant():
     def fn(inputs):
         q, args = inputs
         sometimes = jnp.where(q[0] > 5, q[0], 0), jnp.where(q[0] > 5, 1.0, 0.0)
@@ -93,7 +93,7 @@ def test_zeros_that_hold_only_here_are_no_constants():
 
 
 @pytest.mark.parametrize("jit", [False, True])
-def test_a_body_in_euler_parameters_is_a_place_and_a_rotation(jit):
+def test_a_body_in_euler_parameters_has_blocks_for_position_and_rotation(jit):
     """The three entries of the place of the top are themselves."""
     system, start, args = problems.heavy_top()
     found = []
@@ -113,7 +113,7 @@ def test_a_body_in_euler_parameters_is_a_place_and_a_rotation(jit):
 
 
 @pytest.mark.slow
-def test_derivatives_of_inverses_are_seen_through():
+def test_derivatives_of_inverses_keep_the_pattern():
     """They keep the name of the inverse, and have more inputs and outputs."""
     matrix = lambda x: jnp.outer(x, jnp.sin(x)) + 3 * jnp.eye(x.size)
     value = lambda x: x @ inverse(matrix(x)) @ x
