@@ -54,9 +54,9 @@ def test_the_readme_links_to_every_page():
     assert [page.name for page in PAGES[1:] if f"(docs/{page.name})" not in text] == []
 
 
-def test_the_map_of_the_rooms_is_complete():
+def test_the_table_of_subpackages_is_complete():
     text = (HOME / "docs" / "how-it-works.md").read_text()
     package = pathlib.Path(ej.__file__).parent
-    rooms = [path.parent.name for path in package.glob("*/__init__.py")]
-    assert len(rooms) > 5
-    assert [room for room in rooms if f"| `{room}` |" not in text] == []
+    names = [path.parent.name for path in package.glob("*/__init__.py")]
+    assert len(names) > 5
+    assert [name for name in names if f"| `{name}` |" not in text] == []
