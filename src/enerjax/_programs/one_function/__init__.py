@@ -6,7 +6,3 @@ than the operations. XLA can compile a small loop into one function (see `fast_l
 and does the same with any call that carries the mark of such a loop. Only operations that
 need nothing from XLA's runtime are possible inside.
 """
-
-from .calls import in_one_function as in_one_function, unmerged as unmerged
-from .possible import LARGEST_SUM as LARGEST_SUM
-from .products import written_out as written_out
