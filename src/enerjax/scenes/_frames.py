@@ -14,13 +14,22 @@ Numbers: TypeAlias = dict[str, Any]
 class Frame(NamedTuple):
     """Where a body is: its origin, and its axes as the rows of a matrix, in space.
 
-    Fields that nothing reads are `None`. So are the axes where nothing turns, and the
-    frame is parallel to that of space.
+    - `origin`: the mass centre, shape `(d,)` (length).
+    - `axes`: shape `(d, d)`, the transpose of the `rotation` matrix; `None` where no body
+      turns, and the frame is parallel to that of space.
+    - `angle`: in the plane, over any number of turns (radians).
+
+    Fields that a law does not read are `None`.
     """
 
     origin: Any = None
     axes: Any = None
     angle: Any = None
+
+    @property
+    def rotation(self) -> Float[Array, "d d"]:
+        """The rotation matrix: the body axes in space along its columns."""
+        return jnp.eye(self.origin.size) if self.axes is None else self.axes.T
 
     def point(self, point: Point) -> Point:
         """A point of the body in space: linear in the origin and the axes."""
@@ -31,3 +40,9 @@ class Frame(NamedTuple):
         if self.axes is None:
             return direction
         return jnp.sum(direction[:, None] * self.axes, axis=0)
+
+    def components(self, direction: Point) -> Point:
+        """A direction in space, in the axes of the body."""
+        if self.axes is None:
+            return direction
+        return jnp.sum(self.axes * direction[None], axis=1)

@@ -16,13 +16,23 @@ from ._frames import Frame, Numbers, Point
 
 
 class AbstractLaw(abc.ABC):
-    """A function of the frames of two bodies; `reads` are the fields of a frame in use."""
+    """What a part computes from the frames of two bodies.
+
+    Written for one part. Parts with equal laws are evaluated together, and scenes with
+    equal laws share their programs: a law is a frozen dataclass, and what differs from
+    part to part is in its `numbers`.
+
+    - `reads`: the fields of a frame in use, of `"origin"`, `"axes"` and `"angle"`.
+    """
 
     reads: ClassVar[tuple[str, ...]] = ("origin", "axes")
 
     @abc.abstractmethod
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Any:
-        """Rows that vanish, of a joint; an energy, of a force; the value of a measure."""
+        """Rows that vanish, of a joint; an energy, of a force; the value of a measure.
+
+        `numbers` are those of one part, from its `resolve`: floats and arrays by name.
+        """
 
 
 def offset(a: Frame, b: Frame, numbers: Numbers) -> Point:

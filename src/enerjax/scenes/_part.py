@@ -32,7 +32,7 @@ class AbstractPart(eqx.Module):
 
 
 class AbstractForce(AbstractPart):
-    """A force of a scene; its law is that of its energy, or of its push."""
+    """A force of a scene; its law is that of its energy, or of its force."""
 
 
 class AbstractFunctionOfPose(eqx.Module):
