@@ -3,6 +3,7 @@ others."""
 
 import re
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -259,6 +260,7 @@ def test_a_drag_of_ones_own_slows_down_and_its_work_is_in_the_audit():
     lost = sol.audit.energy[0] - sol.audit.energy[-1]
     assert -np.sum(sol.audit.work) == pytest.approx(float(lost), rel=1e-12)  # round-off
     read = scene.measure(sol, "air")
+    assert read.force is not None
     drag = -coefficient * found[:, 1] ** 2
     np.testing.assert_allclose(read.force[:, 1], drag, rtol=1e-12)  # round-off
 
@@ -297,14 +299,14 @@ def law_of(base, returned, method="__call__", **fields):
 
 
 class AnyJoint(ej.joints.AbstractJoint):
-    found: object
+    found: Any
 
     def resolve(self, ends):
         return self.found
 
 
 class AnyForce(ej.forces.AbstractForce):
-    found: object
+    found: Any
 
     def resolve(self, ends):
         return self.found
@@ -320,7 +322,7 @@ class WithList(ENERGY):
     weights: list
 
     def __call__(self, a, b, numbers):
-        return 0.0
+        return jnp.zeros(())
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,9 @@ class Frame(NamedTuple):
     @property
     def rotation(self) -> Float[Array, "d d"]:
         """The rotation matrix: the body axes in space along its columns."""
-        return jnp.eye(self.origin.size) if self.axes is None else self.axes.T
+        if self.axes is None:
+            return jnp.eye(self.origin.size, dtype=self.origin.dtype)
+        return self.axes.T
 
     def point(self, point: Point) -> Point:
         """A point of the body in space: linear in the origin and the axes."""

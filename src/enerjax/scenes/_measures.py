@@ -41,7 +41,7 @@ def offset(a: Frame, b: Frame, numbers: Numbers) -> Point:
 
 
 class AbstractMeasure(AbstractLaw):
-    """A length, an angle (`is_angle`), or a place (`is_vector`, one in space)."""
+    """A length, an angle (`is_angle`), or a vector (`is_vector`), as a place in space."""
 
     is_angle: ClassVar[bool] = False
     is_vector: ClassVar[bool] = False
