@@ -4,7 +4,9 @@ Compilation dominates: runs are cached, those that differ in numbers alone share
 and `march` has one program for all numbers of steps.
 """
 
+import ast
 import functools
+import pathlib
 from types import SimpleNamespace
 
 import equinox as eqx
@@ -17,6 +19,21 @@ import enerjax as ej
 
 
 EPS = float(np.finfo(float).eps)
+HERE = pathlib.Path(__file__).parent
+
+
+def imported(name):
+    """The modules that a file beside this one imports; fails for private names of them."""
+    found = set()
+    for node in ast.walk(ast.parse((HERE / name).read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert not any(alias.name.startswith("_") for alias in node.names)
+            found.add(node.module)
+    assert not any(part.startswith("_") for module in found for part in module.split("."))
+    return found
+
 
 PROBLEMS = {
     "angle": ej.problems.pendulum_angle,

@@ -37,7 +37,12 @@ from ._run import (
     StepOutput as StepOutput,
     Warm as Warm,
 )
-from ._solvers import KLU as KLU, Newton as Newton
+from ._solvers import (
+    AbstractSparseSolver as AbstractSparseSolver,
+    KLU as KLU,
+    Newton as Newton,
+    SparsePattern as SparsePattern,
+)
 from ._system import (
     AbstractSystem as AbstractSystem,
     Elements as Elements,

@@ -30,7 +30,11 @@ from .linear.jacobian import (
 )
 from .linear.norms import largest as largest
 from .linear.symmetric import cholesky as cholesky, eigh as eigh
-from .linear.user_solver import KLU as KLU
+from .linear.user_solver import (
+    AbstractSparseSolver as AbstractSparseSolver,
+    KLU as KLU,
+    SparsePattern as SparsePattern,
+)
 from .newton import Newton as Newton
 from .newton_iterations import max_norm as max_norm
 from .root import find_root as find_root, ROOT as ROOT

@@ -8,7 +8,7 @@ from jaxtyping import Array, PyTree
 from .._programs import is_known
 from .._types import Flag, Scalar
 from .linear.dense import AbstractFactors
-from .linear.user_solver import KLU
+from .linear.user_solver import AbstractSparseSolver
 
 
 class Newton(eqx.Module):
@@ -30,9 +30,10 @@ class Newton(eqx.Module):
 
     - `rtol`: bound on the predicted error, in units of round-off of the dtype.
     - `atol`: bound on the residual, in the same units.
-    - `linear_solver`: for its corrections and for derivatives of the root; one of lineax,
-      given the dense Jacobian, or `KLU()` where it is large and sparse. Without it size
-      and structure decide: plain operations up to 32 unknowns, LAPACK, and above 64 the
+    - `linear_solver`: for its corrections and for derivatives of the root: an
+      `AbstractSparseSolver`, such as `KLU()`, given the entries of the Jacobian that can
+      differ from zero, or one of lineax, given the dense Jacobian. Without it size and
+      structure decide: plain operations up to 32 unknowns, LAPACK, and above 64 the
       narrow band that the pattern of the equations can be numbered into, if there is one.
       A scheme can name weak couplings without which the band is narrower: the search then
       does without them, and begins again with them where it fails. Derivatives are exact.
@@ -43,13 +44,15 @@ class Newton(eqx.Module):
 
     rtol: float = 1.0
     atol: float = 8.0
-    linear_solver: lx.AbstractLinearSolver | KLU | None = None
+    linear_solver: lx.AbstractLinearSolver | AbstractSparseSolver | None = None
 
     def __check_init__(self):
-        if not isinstance(self.linear_solver, lx.AbstractLinearSolver | KLU | None):
+        solvers = lx.AbstractLinearSolver | AbstractSparseSolver | None
+        if not isinstance(self.linear_solver, solvers):
             raise TypeError(
                 "`Newton(linear_solver=...)` must be a solver of lineax, such as "
-                f"`lineax.LU()`, or `enerjax.KLU()`; got {self.linear_solver!r}."
+                "`lineax.LU()`, or an `enerjax.AbstractSparseSolver`, such as "
+                f"`enerjax.KLU()`; got {self.linear_solver!r}."
             )
         for name, bound in (("rtol", self.rtol), ("atol", self.atol)):
             if is_known(bound) and not (np.isreal(bound) and 0 < bound < np.inf):

@@ -2,7 +2,23 @@
 
 from . import bodies as bodies, drives as drives, forces as forces, joints as joints
 from ._body_coordinates import quaternion_rates as quaternion_rates, rotation as rotation
+from ._ends import Ends as Ends
+from ._frames import Frame as Frame
 from ._gaps import Gap as Gap
+from ._laws import (
+    AbstractConstraintLaw as AbstractConstraintLaw,
+    AbstractForceLaw as AbstractForceLaw,
+    AbstractPotentialLaw as AbstractPotentialLaw,
+    AbstractSpringLaw as AbstractSpringLaw,
+)
+from ._measures import (
+    AbstractMeasure as AbstractMeasure,
+    Place as Place,
+    PlanarTurn as PlanarTurn,
+    Separation as Separation,
+    Slide as Slide,
+    Turn as Turn,
+)
 from ._parameters import Parameters as Parameters
 from ._readouts import Readout as Readout
 from ._relative_motions import Reaction as Reaction

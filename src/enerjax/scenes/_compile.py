@@ -14,7 +14,7 @@ from .._types import Coordinates
 from ._arguments import module_of, number
 from ._ends import Ends, Hinge, Hinges
 from ._frames import Frame, GROUND, Numbers
-from ._laws import Alignment
+from ._law_checks import resolved_part
 from ._layout import Layout, Link, numbers_of
 from ._parameters import Parameters
 from ._view import View
@@ -78,7 +78,7 @@ def compile_parts(
     ends = _StartPose(bodies, rows)
     resolved = {}
     for kind in (AbstractJoint, AbstractForce, AbstractDrive):
-        resolved[kind] = [(part, *part.resolve(ends(part))) for part in found[kind]]
+        resolved[kind] = [(part, *resolved_part(part, ends(part))) for part in found[kind]]
         ends.hinges = _hinges(ends, resolved[AbstractJoint])
     links = {
         kind: tuple(
@@ -108,10 +108,10 @@ def compile_parts(
 def _hinges(ends: "_StartPose", joints: list[tuple]) -> Hinges:
     found = []
     for part, law, numbers in joints:
-        if not isinstance(law, Alignment) or not (law.keeps_axis or law.keeps_directions):
+        if law.keeps is None:
             continue
         of_a = ends(part).frames[0].axes
-        axis = numbers["frame_a"][2] @ of_a if law.keeps_axis else None
+        axis = numbers["frame_a"][2] @ of_a if law.keeps == "axis" else None
         found.append(Hinge(part.name, frozenset((part.a, part.b)), axis))
     return Hinges(found)
 

@@ -8,9 +8,9 @@ from jaxtyping import Array
 
 from .._types import Coordinates, Scalar, Vector, Velocities
 from ._frames import Numbers, Point
-from ._laws import AbstractElastic, AbstractPush, Alignment, Driven, Length
+from ._laws import AbstractConstraintLaw, AbstractForceLaw, AbstractSpringLaw, Driven
 from ._layout import Layout, Links
-from ._measures import AbstractLaw, AbstractMeasure, PlanarTurn, Separation, Slide, Turn
+from ._measures import AbstractMeasure
 from ._parameters import Parameters
 from ._view import evaluate, lift, View
 
@@ -90,26 +90,12 @@ def measures_of(layout: Layout) -> dict[str, AbstractMeasure]:
     """The measures of all parts that have one."""
     found = {}
     for link in (*layout.joints, *layout.forces, *layout.drives):
-        turn = all(k == 0 or bool(layout.turning[k]) for k in (link.a, link.b))
-        measure = _measure(link.law, layout.dimension, turn)
-        if measure is not None:
-            found[link.name] = measure
+        if isinstance(link.law, _MEASURED) and link.law.measure is not None:
+            found[link.name] = link.law.measure
     return found
 
 
-def _measure(law: AbstractLaw, dimension: int, both_turn: bool) -> AbstractMeasure | None:
-    if isinstance(law, AbstractElastic | AbstractPush | Driven):
-        return law.measure
-    if isinstance(law, Length):
-        return Separation()
-    if not isinstance(law, Alignment):
-        return None
-    if law.keeps_axis:
-        return Turn()
-    if law.along is not None:
-        return Slide()
-    pins = dimension == 2 and not law.square
-    return PlanarTurn() if pins and both_turn else None
+_MEASURED = AbstractConstraintLaw | AbstractSpringLaw | AbstractForceLaw | Driven
 
 
 def link_of(layout: Layout, name: str, args: Parameters) -> tuple[Links, Numbers]:

@@ -14,13 +14,24 @@ Numbers: TypeAlias = dict[str, Any]
 class Frame(NamedTuple):
     """The origin of a body, and its axes as the rows of a matrix, in space.
 
-    Fields that a law does not read are `None`. So are the axes of bodies without an
-    orientation, whose frames stay parallel to that of space.
+    - `origin`: the mass centre, shape `(d,)` (length).
+    - `axes`: shape `(d, d)`, the transpose of the `rotation` matrix; `None` for bodies
+      without an orientation, whose frames stay parallel to that of space.
+    - `angle`: in the plane, over any number of turns (radians).
+
+    Fields that a law does not read are `None`.
     """
 
     origin: Any = None
     axes: Any = None
     angle: Any = None
+
+    @property
+    def rotation(self) -> Float[Array, "d d"]:
+        """The rotation matrix: the body axes in space along its columns."""
+        if self.axes is None:
+            return jnp.eye(self.origin.size, dtype=self.origin.dtype)
+        return self.axes.T
 
     def point(self, point: Point) -> Point:
         """A point of the body in space, linear in the origin and the axes."""
@@ -31,3 +42,9 @@ class Frame(NamedTuple):
         if self.axes is None:
             return direction
         return jnp.sum(direction[:, None] * self.axes, axis=0)
+
+    def components(self, direction: Point) -> Point:
+        """A direction in space, in the axes of the body."""
+        if self.axes is None:
+            return direction
+        return jnp.sum(self.axes * direction[None], axis=1)

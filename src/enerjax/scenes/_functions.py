@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from .._system import System
 from .._types import Coordinates, Multipliers, Scalar, Velocities
 from ._feedback import Moving
-from ._laws import AbstractPush, Acting, Driven
+from ._laws import AbstractForceLaw, Acting, Driven
 from ._layout import Layout, Links
 from ._parameters import Parameters
 from ._user_functions import ask, vector_of
@@ -48,7 +48,7 @@ def potential(layout: Layout, q: Coordinates, args: Parameters) -> Scalar:
     if layout.has_gravity:
         energy = energy - _weight(view, args)
     for group, numbers in zip(layout.force_groups, args.tables["forces"], strict=True):
-        if not isinstance(group.law, AbstractPush):
+        if not isinstance(group.law, AbstractForceLaw):
             energy = energy + jnp.sum(evaluate(group, view, numbers))
     for name, function in layout.potentials:
         energy = energy + ask(name, function, view, args)
@@ -109,8 +109,7 @@ def at_time(
 
     All links of a group have the same signal. Those of forces may depend on the `view`.
     """
-    assert isinstance(group.law, AbstractPush | Driven)
-    if group.law.signal is None:
+    if not isinstance(group.law, Acting | Driven):
         return numbers
     feedback = isinstance(group.law, Acting) and group.law.feedback
     inputs = (view, t, args) if feedback else (t, args)
@@ -131,7 +130,7 @@ def force(
     groups = [
         (group, at_time(group, numbers, t, args, view))
         for group, numbers in zip(layout.force_groups, args.tables["forces"], strict=True)
-        if isinstance(group.law, AbstractPush)
+        if isinstance(group.law, AbstractForceLaw)
     ]
 
     def measures(x: Coordinates) -> list[Array]:
@@ -146,9 +145,9 @@ def force(
 
 def pushes(group: Links, numbers: dict[str, Array], view: View, rate: Array) -> Array:
     """The forces of all links along their measures."""
-    assert isinstance(group.law, AbstractPush)
-    frames = view.frames(group.b, group.law.reads)
-    return jax.vmap(group.law.push)(frames, rate, numbers)
+    assert isinstance(group.law, AbstractForceLaw)
+    a, b = (view.frames(bodies, group.law.reads) for bodies in (group.a, group.b))
+    return jax.vmap(group.law.force)(a, b, rate, numbers)
 
 
 def velocity_map(layout: Layout, q: Coordinates, args: Parameters) -> Float[Array, "nv nq"]:

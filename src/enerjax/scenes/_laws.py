@@ -8,7 +8,7 @@ chain rule for difference quotients conserves energy and momenta to round-off.
 import abc
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -16,11 +16,35 @@ from typing_extensions import TypeAliasType
 
 from .._types import Args, Multipliers, Scalar
 from ._frames import Frame, Numbers, Point
-from ._measures import AbstractLaw, AbstractMeasure, offset
+from ._measures import AbstractLaw, AbstractMeasure, offset, Separation
+
+
+# What a joint leaves of the turning of its bodies against each other.
+Keeps: TypeAlias = Literal["axis", "directions"] | None
+
+
+class AbstractConstraintLaw(AbstractLaw):
+    """The rows of a joint: smooth functions of two frames that vanish, a vector.
+
+    - `measure`: the length or angle that `scene.measure` tells of the joint, if any.
+    - `keeps`: in space, `"axis"` where the last row of `numbers["frame_a"]` stays an axis
+      of both bodies, so that springs, dampers and drives can act on the angle about it;
+      `"directions"` where the bodies do not turn against each other; else `None`.
+
+    If there is a `numbers["point_b"]`, it is the point of the second body about which the
+    torque of a reaction is taken.
+    """
+
+    measure: AbstractMeasure | None = None
+    keeps: Keeps = None
+
+    @abc.abstractmethod
+    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Multipliers:
+        """The rows, shape `(rows,)`."""
 
 
 @dataclass(frozen=True)
-class Alignment(AbstractLaw):
+class Alignment(AbstractConstraintLaw):
     """Keeps two points together and pairs of axes perpendicular.
 
     - `along`: the axes of the first frame along which the points must coincide; `None` if
@@ -30,20 +54,12 @@ class Alignment(AbstractLaw):
 
     along: tuple[int, ...] | None
     square: tuple[tuple[int, int], ...] = ()
+    measure: AbstractMeasure | None = None
+    keeps: Keeps = None
 
     @property
     def has_frames(self) -> bool:
         return bool(self.square or self.along)
-
-    @property
-    def keeps_directions(self) -> bool:
-        """Whether the second frame cannot turn relative to the first."""
-        return len(self.square) == 3
-
-    @property
-    def keeps_axis(self) -> bool:
-        """Whether the last axis of both frames stays the same."""
-        return self.square == ((2, 0), (2, 1))
 
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Multipliers:
         apart = offset(a, b, numbers)
@@ -59,23 +75,31 @@ class Alignment(AbstractLaw):
 
 
 @dataclass(frozen=True)
-class Length(AbstractLaw):
+class Length(AbstractConstraintLaw):
+    measure = Separation()
+
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Multipliers:
         return (jnp.sum(offset(a, b, numbers) ** 2) - numbers["length"] ** 2)[None]
 
 
 @dataclass(frozen=True)
-class Curve(AbstractLaw):
+class Curve(AbstractConstraintLaw):
     function: Callable[[Point, Numbers], Multipliers]
 
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Multipliers:
         apart = b.point(numbers["point_b"]) - a.origin
-        if a.axes is not None:
-            apart = jnp.sum(a.axes * apart[None], axis=1)
-        return self.function(apart, numbers)
+        return self.function(a.components(apart), numbers)
 
 
-class AbstractElastic(AbstractLaw):
+class AbstractPotentialLaw(AbstractLaw):
+    """A potential energy of two bodies, a smooth function of their frames."""
+
+    @abc.abstractmethod
+    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Scalar:
+        """The energy, a scalar."""
+
+
+class AbstractSpringLaw(AbstractLaw):
     """A potential energy of a measure; the force along the measure is minus its slope."""
 
     measure: AbstractMeasure
@@ -89,11 +113,11 @@ class AbstractElastic(AbstractLaw):
 
     @abc.abstractmethod
     def energy(self, value: Array, numbers: Numbers) -> Scalar:
-        """The energy, for the value of the measure."""
+        """The energy, a scalar, for the value of the measure."""
 
 
 @dataclass(frozen=True)
-class Elastic(AbstractElastic):
+class Elastic(AbstractSpringLaw):
     """A linear spring, whose force vanishes if the measure is `numbers[rest]`."""
 
     measure: AbstractMeasure
@@ -104,7 +128,7 @@ class Elastic(AbstractElastic):
 
 
 @dataclass(frozen=True)
-class Steady(AbstractElastic):
+class Steady(AbstractSpringLaw):
     """A constant force `numbers[load]` along a measure."""
 
     measure: AbstractMeasure
@@ -149,11 +173,10 @@ class Missed(AbstractLaw):
         return self.measure.missed(a, b, numbers, numbers["value"])
 
 
-class AbstractPush(AbstractLaw):
-    """A force along a measure that has no potential."""
+class AbstractForceLaw(AbstractLaw):
+    """A force along a measure that has no potential; its power is `force * rate`."""
 
     measure: AbstractMeasure
-    signal: Callable[..., Array] | None
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -163,21 +186,20 @@ class AbstractPush(AbstractLaw):
         return self.measure(a, b, numbers)
 
     @abc.abstractmethod
-    def push(self, b: Frame, rate: Array, numbers: Numbers) -> Array:
-        """The force for this rate of the measure."""
+    def force(self, a: Frame, b: Frame, rate: Array, numbers: Numbers) -> Array:
+        """The force at this rate of the measure, of the shape of the measure."""
 
 
 @dataclass(frozen=True)
-class Viscous(AbstractPush):
+class Viscous(AbstractForceLaw):
     measure: AbstractMeasure
-    signal: None = None
 
-    def push(self, b: Frame, rate: Array, numbers: Numbers) -> Array:
+    def force(self, a: Frame, b: Frame, rate: Array, numbers: Numbers) -> Array:
         return -numbers["damping"] * rate
 
 
 @dataclass(frozen=True)
-class Acting(AbstractPush):
+class Acting(AbstractForceLaw):
     """A force with the value of a signal, which is in `numbers["value"]`.
 
     With `feedback` the signal also depends on the motion of the bodies.
@@ -187,7 +209,7 @@ class Acting(AbstractPush):
     signal: Callable[..., Array]
     feedback: bool
 
-    def push(self, b: Frame, rate: Array, numbers: Numbers) -> Array:
+    def force(self, a: Frame, b: Frame, rate: Array, numbers: Numbers) -> Array:
         return numbers["value"]
 
 
@@ -195,5 +217,5 @@ class Acting(AbstractPush):
 class Following(Acting):
     """A force whose signal is a vector in the axes of its body."""
 
-    def push(self, b: Frame, rate: Array, numbers: Numbers) -> Array:
+    def force(self, a: Frame, b: Frame, rate: Array, numbers: Numbers) -> Array:
         return b.direction(numbers["value"])

@@ -9,7 +9,7 @@ import numpy as np
 
 from ._body_coordinates import AbstractBodyCoordinates
 from ._frames import GROUND
-from ._laws import AbstractPush
+from ._laws import AbstractForceLaw
 from ._measures import AbstractLaw
 
 
@@ -102,7 +102,7 @@ class Layout:
 
     @property
     def has_pushes(self) -> bool:
-        return any(isinstance(link.law, AbstractPush) for link in self.forces)
+        return any(isinstance(link.law, AbstractForceLaw) for link in self.forces)
 
     @cached_property
     def places(self) -> dict[str, dict[str, tuple[int, int]]]:

@@ -17,13 +17,23 @@ from ._frames import Frame, Numbers, Point
 
 
 class AbstractLaw(abc.ABC):
-    """A function of the frames of two bodies; `reads` names the fields that it uses."""
+    """A function of the frames of two bodies, written for one part.
+
+    Parts with equal laws are evaluated together, and scenes with equal laws share their
+    programs. A law is therefore a frozen dataclass, and what differs from part to part is
+    in its `numbers`.
+
+    - `reads`: the fields of a frame that it uses, of `"origin"`, `"axes"` and `"angle"`.
+    """
 
     reads: ClassVar[tuple[str, ...]] = ("origin", "axes")
 
     @abc.abstractmethod
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Any:
-        """The constraint of a joint, the energy of a force, or the value of a measure."""
+        """The constraint of a joint, the energy of a force, or the value of a measure.
+
+        `numbers` are those of one part, from its `resolve`: floats and arrays by name.
+        """
 
 
 def offset(a: Frame, b: Frame, numbers: Numbers) -> Point:
@@ -32,7 +42,7 @@ def offset(a: Frame, b: Frame, numbers: Numbers) -> Point:
 
 
 class AbstractMeasure(AbstractLaw):
-    """A length, an angle (`is_angle`), or a position (`is_vector`)."""
+    """A length, an angle (`is_angle`), or a vector (`is_vector`) such as a position."""
 
     is_angle: ClassVar[bool] = False
     is_vector: ClassVar[bool] = False

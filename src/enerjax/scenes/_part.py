@@ -33,7 +33,7 @@ class AbstractPart(eqx.Module):
 
 
 class AbstractForce(AbstractPart):
-    """A force of a scene; its law is an `AbstractElastic` or an `AbstractPush`."""
+    """A force of a scene; its law is that of its energy, or of its force."""
 
 
 class AbstractFunctionOfPose(eqx.Module):

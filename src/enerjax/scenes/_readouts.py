@@ -12,7 +12,7 @@ from .._system import State
 from .._types import Real, Scalar
 from ._feedback import link_of, measure_of, Moving
 from ._functions import at_time, pushes
-from ._laws import AbstractElastic, AbstractPush, Driven, Length
+from ._laws import AbstractForceLaw, AbstractSpringLaw, Driven, Length
 from ._layout import Layout
 from ._measures import Turn
 from ._parameters import Parameters
@@ -63,10 +63,10 @@ def readout(
         group, numbers = link_of(layout, name, args)
         value, rate = view.measured(name)
         force = None
-        if isinstance(group.law, AbstractPush):
+        if isinstance(group.law, AbstractForceLaw):
             numbers = at_time(group, numbers, t, args, view)
             force = pushes(group, numbers, view, rate[None])[0]
-        elif isinstance(group.law, AbstractElastic):
+        elif isinstance(group.law, AbstractSpringLaw):
             own = {key: x[0] for key, x in numbers.items()}
             force = -jax.grad(group.law.energy)(value, own)
         return Readout(value, rate, force)

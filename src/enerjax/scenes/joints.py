@@ -11,6 +11,7 @@ the joint in both bodies, `frame_a` and `frame_b`, as rows (the axis itself is t
 them in space, and the first in the plane).
 """
 
+import abc
 from collections.abc import Callable
 
 import equinox as eqx
@@ -22,14 +23,28 @@ from .._types import Real, Vector
 from ._arguments import module_of, positive
 from ._ends import Ends
 from ._frames import Numbers
-from ._laws import Alignment, Curve, Length
-from ._measures import AbstractLaw
+from ._laws import AbstractConstraintLaw, Alignment, Curve, Length
+from ._measures import AbstractMeasure, PlanarTurn, Slide, Turn
 from ._part import AbstractFunctionOfPose, AbstractPart, only_parts, PoseFunction
 from ._user_functions import check_function, vector_of
 
 
+# Pairs of axes that stay perpendicular where bodies keep an axis, and all directions.
+_SAME_AXIS = ((2, 0), (2, 1))
+_SAME_DIRECTIONS = ((0, 1), (1, 2), (2, 0))
+
+
+def _turn_in_plane(ends: Ends) -> AbstractMeasure | None:
+    """The angle of a pin in the plane, where both bodies have one."""
+    return PlanarTurn() if ends.dimension == 2 and all(ends.turns) else None
+
+
 class AbstractJoint(AbstractPart):
-    """A joint of a scene."""
+    """A joint of a scene; its law is that of its rows."""
+
+    @abc.abstractmethod
+    def resolve(self, ends: Ends) -> tuple[AbstractConstraintLaw, Numbers]:
+        """Its law and its numbers, from the start pose of its bodies."""
 
 
 class AbstractPointJoint(AbstractJoint):
@@ -52,8 +67,9 @@ class Spherical(AbstractPointJoint):
     Their multipliers are minus the force on the second body.
     """
 
-    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
-        return Alignment(None), ends.points(self.point_a, self.point_b)
+    def resolve(self, ends: Ends) -> tuple[AbstractConstraintLaw, Numbers]:
+        points = ends.points(self.point_a, self.point_b)
+        return Alignment(None, measure=_turn_in_plane(ends)), points
 
 
 class Revolute(AbstractAxisJoint):
@@ -63,12 +79,12 @@ class Revolute(AbstractAxisJoint):
     frame of the first body, `axis_b` in that of the second.
     """
 
-    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+    def resolve(self, ends: Ends) -> tuple[AbstractConstraintLaw, Numbers]:
         points = ends.points(self.point_a, self.point_b)
         if ends.dimension == 2:
             ends.refuse_axes(self.axis, self.axis_b)
-            return Alignment(None), points
-        law = Alignment(None, ((2, 0), (2, 1)))
+            return Alignment(None, measure=_turn_in_plane(ends)), points
+        law = Alignment(None, _SAME_AXIS, Turn(), "axis")
         return law, points | ends.axes(self.axis, self.axis_b)
 
 
@@ -78,7 +94,7 @@ class Universal(AbstractAxisJoint):
     Four constraints. `axis` is fixed in the first body, `axis_b` in the second.
     """
 
-    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+    def resolve(self, ends: Ends) -> tuple[AbstractConstraintLaw, Numbers]:
         ends.only_in_space("A universal joint")
         points = ends.points(self.point_a, self.point_b)
         return Alignment(None, ((2, 2),)), points | ends.two_axes(self.axis, self.axis_b)
@@ -92,11 +108,11 @@ class Prismatic(AbstractPointJoint):
 
     axis: Vector | None = None
 
-    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+    def resolve(self, ends: Ends) -> tuple[AbstractConstraintLaw, Numbers]:
         numbers = ends.points(self.point_a, self.point_b) | ends.axes(self.axis)
         if ends.dimension == 2:
-            return Alignment((1,), ((0, 1),)), numbers
-        return Alignment((0, 1), ((0, 1), (1, 2), (2, 0))), numbers
+            return Alignment((1,), ((0, 1),), Slide()), numbers
+        return Alignment((0, 1), _SAME_DIRECTIONS, Slide(), "directions"), numbers
 
 
 class Cylindrical(AbstractAxisJoint):
@@ -105,10 +121,10 @@ class Cylindrical(AbstractAxisJoint):
     Four constraints.
     """
 
-    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+    def resolve(self, ends: Ends) -> tuple[AbstractConstraintLaw, Numbers]:
         ends.only_in_space("A cylindrical joint")
         numbers = ends.points(self.point_a, self.point_b)
-        law = Alignment((0, 1), ((2, 0), (2, 1)))
+        law = Alignment((0, 1), _SAME_AXIS, Turn(), "axis")
         return law, numbers | ends.axes(self.axis, self.axis_b)
 
 
@@ -118,10 +134,10 @@ class Planar(AbstractAxisJoint):
     Three constraints, in space.
     """
 
-    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+    def resolve(self, ends: Ends) -> tuple[AbstractConstraintLaw, Numbers]:
         ends.only_in_space("A planar joint")
         numbers = ends.points(self.point_a, self.point_b)
-        law = Alignment((2,), ((2, 0), (2, 1)))
+        law = Alignment((2,), _SAME_AXIS, Turn(), "axis")
         return law, numbers | ends.axes(self.axis, self.axis_b)
 
 
@@ -131,11 +147,12 @@ class Fixed(AbstractPointJoint):
     Three constraints in the plane, six in space.
     """
 
-    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+    def resolve(self, ends: Ends) -> tuple[AbstractConstraintLaw, Numbers]:
         axis = [1.0, 0.0, 0.0][: ends.dimension]
         numbers = ends.points(self.point_a, self.point_b) | ends.axes(axis)
-        square = ((0, 1),) if ends.dimension == 2 else ((0, 1), (1, 2), (2, 0))
-        return Alignment(None, square), numbers
+        if ends.dimension == 2:
+            return Alignment(None, ((0, 1),)), numbers
+        return Alignment(None, _SAME_DIRECTIONS, keeps="directions"), numbers
 
 
 class Distance(AbstractPointJoint):
@@ -147,7 +164,7 @@ class Distance(AbstractPointJoint):
 
     length: Real | None = None
 
-    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+    def resolve(self, ends: Ends) -> tuple[AbstractConstraintLaw, Numbers]:
         numbers, start = ends.separate_points(self.point_a, self.point_b)
         length = start if self.length is None else self.length
         return Length(), numbers | dict(length=positive(ends.part, "`length`", length))
@@ -169,7 +186,7 @@ class OnCurve(AbstractJoint):
     def __check_init__(self):
         check_function(self.name, "curve", self.curve, "x", "numbers")
 
-    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+    def resolve(self, ends: Ends) -> tuple[AbstractConstraintLaw, Numbers]:
         own = {
             key: module_of(value).asarray(value) * 1.0
             for key, value in self.numbers.items()

@@ -17,6 +17,7 @@ from ._constraint_rows import check_reacting, row_names, rows_of
 from ._feedback import Moving
 from ._functions import make_system
 from ._gaps import Gap, Measured
+from ._law_checks import check_laws
 from ._parameters import Parameters
 from ._readouts import measured_along, Readout
 from ._relative_motions import each, Reaction, reaction
@@ -88,6 +89,7 @@ class Scene:
         self._kinds = {part.name: type(part).__name__ for part in parts}
         self.system = make_system(self._layout, redundant)
         self.q, self.v = (join([getattr(b, x) for b in bodies]) for x in ("q", "v"))
+        check_laws(self._layout, self.q, self.args)
         self._rows = rows_of(self._layout, self.q, self.args)
         if self.system.force is not None:  # checks the users' functions
             t = jnp.zeros((), self.q.dtype)

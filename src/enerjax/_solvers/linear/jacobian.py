@@ -21,7 +21,7 @@ from ..._programs import (
 )
 from .banded import Band, coloured_products, column_colours
 from .dense import AbstractFactors, Inverse, inverse, LU, SMALL, solve
-from .user_solver import KLU, LineaxFactors, Scattered
+from .user_solver import AbstractSparseSolver, LineaxFactors, Scattered
 
 
 class Full:
@@ -146,12 +146,14 @@ class Linearisable(eqx.Module):
             image = jax.jvp(self.value, (x,), (t,))[1]
             return image if self.regularisation is None else image + self.regularisation * t
 
-        return lambda right: jax.lax.custom_linear_solve(
-            product,
-            right,
-            lambda _, right: factors.solve(right),
+        def solve_transposed(_: Callable, right: Array) -> Array:
+            if isinstance(self.form, Scattered):
+                return self.form.solve_transposed(matrix, right)
             # (`linear_transpose` has no rule for what is one function.)
-            lambda _, right: jax.vjp(factors.solve, right)[1](right)[0],
+            return jax.vjp(factors.solve, right)[1](right)[0]
+
+        return lambda right: jax.lax.custom_linear_solve(
+            product, right, lambda _, right: factors.solve(right), solve_transposed
         )
 
 
@@ -159,7 +161,7 @@ def linearisable(
     fn: Callable[[Array, PyTree], Array],
     like: Float[Array, " n"],
     args: Any,
-    linear_solver: lx.AbstractLinearSolver | KLU | None = None,
+    linear_solver: lx.AbstractLinearSolver | AbstractSparseSolver | None = None,
     regularisation: Float[Array, " n"] | None = None,
 ) -> Linearisable:
     """`fn(x, args)` as a function of `x`; what it depends on must be in `args`.
@@ -173,11 +175,13 @@ def linearisable(
     regularised = (
         value if regularisation is None else lambda x: value(x) + regularisation * x
     )
+    if linear_solver is not None:
+        pattern = jacobian_pattern(regularised, like)
+        form = Scattered(linear_solver, pattern, like.size)
+        return Linearisable(value, form, regularisation)
     pattern = jacobian_pattern(regularised, like) if like.size > LARGE else None
     if pattern is None:
         return Linearisable(value, Full(None), regularisation)
-    if isinstance(linear_solver, KLU):
-        return Linearisable(value, Scattered(pattern), regularisation)
     band = Band(pattern)
     form = band if band.worth_it() else Full(None, pattern)
     return Linearisable(value, form, regularisation)
