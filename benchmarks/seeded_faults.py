@@ -5,9 +5,9 @@ mistakes that are easy to make and hard to see: most of them keep the energy bal
 touch one branch, one shape or one lane only. Each is applied to a copy of the project in a
 temporary folder; the test files that ought to notice run there, up to the first failure.
 
-    python benchmarks/seeded_faults.py              # all faults, an hour on one core
-    python benchmarks/seeded_faults.py --only NAME  # those whose names begin so
-    python benchmarks/seeded_faults.py --all        # all fast tests where a fault survives
+    python benchmarks/seeded_faults.py                  # all faults, an hour on one core
+    python benchmarks/seeded_faults.py --only saving    # those whose names begin so
+    python benchmarks/seeded_faults.py --all            # all fast tests for survivors
 """
 
 import argparse
@@ -58,17 +58,14 @@ class Finding:
 
 def main() -> None:
     options = _options()
-    chosen = [x for x in FAULTS if x.name.startswith(options.only or "")]
+    chosen = [x for x in FAULTS if x.name.startswith(tuple(options.only))]
     if not chosen:
-        raise SystemExit(f"No fault is called {options.only!r}.")
+        raise SystemExit(f"No fault has a name that begins with {options.only}.")
     names = [x.name for x in FAULTS]
     assert len(set(names)) == len(names), "two faults have one name"
     saved = options.out / "seeded_faults.json"
-    found = (
-        {row["name"]: row for row in json.loads(saved.read_text())}
-        if (saved.exists())
-        else {}
-    )
+    old = json.loads(saved.read_text()) if saved.exists() else []
+    found = {row["name"]: row for row in old}
     with tempfile.TemporaryDirectory() as folder:
         copy = _copied(Path(folder))
         for fault in chosen:
@@ -84,7 +81,7 @@ def main() -> None:
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--only", help="the beginning of the names of faults")
+    parser.add_argument("--only", nargs="+", default=[""], help="beginnings of names")
     parser.add_argument("--all", action="store_true", help="the whole suite for survivors")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     return parser.parse_args()
