@@ -30,14 +30,6 @@ FAULTS = (
         of("general_energies"),
     ),
     Fault(
-        "start: accelerations of momenta",
-        "_analysis/initial.py",
-        "        accelerations=user_rates.v,\n",
-        "        accelerations=acceleration,\n",
-        "Accelerations of a system with varying inertia are rates of its momenta.",
-        of("general_energies", "initial"),
-    ),
-    Fault(
         "equilibrium: multipliers in another unit",
         "_analysis/equilibrium.py",
         "    multipliers = size * tension / scales.constraint\n",
@@ -151,14 +143,6 @@ FAULTS = (
         of("scene_servos", "scene_drives"),
     ),
     Fault(
-        "measures: rates of quaternions",
-        "scenes/_body_coordinates.py",
-        "0.25 * v[3:] @ self._rates(q[3:])",
-        "0.5 * v[3:] @ self._rates(q[3:])",
-        "Measured rates of bodies in quaternions are twice as large.",
-        of("scene_servos", "scene_forces"),
-    ),
-    Fault(
         "reactions: torque about the mass centre",
         "scenes/_relative_motions.py",
         "    pivot = pivot_of(b, numbers)\n",
@@ -175,14 +159,6 @@ FAULTS = (
         of("scenes", "scene_starts"),
     ),
     # Problems ---------------------------------------------------------------------------
-    Fault(
-        "problems: the parallel axis",
-        "problems/_rigid_bodies.py",
-        'jnp.diag(args["J"]) + args["m"] * away',
-        'jnp.diag(args["J"]) + 0.5 * args["m"] * away',
-        "The inertia of a top about its tip has half of the parallel-axis term.",
-        of("problems", "momenta"),
-    ),
     Fault(
         "problems: gravity of the elastic pendulum",
         "problems/_springs.py",
@@ -206,14 +182,6 @@ FAULTS = (
         "for axis, names in reversed(list(enumerate(self.axes))):",
         "for axis, names in list(enumerate(self.axes)):",
         "A choice along two axes takes the second one from another axis.",
-        of("sweep"),
-    ),
-    Fault(
-        "sweeps: the lane that fills a chunk",
-        "_tools/sweep/program.py",
-        "[: self.lanes] for x",
-        "[-self.lanes :] for x",
-        "The last chunk returns the lanes that only fill it.",
         of("sweep"),
     ),
     Fault(

@@ -96,14 +96,6 @@ FAULTS = (
         of("large_systems"),
     ),
     Fault(
-        "sparsity: the case that is not chosen",
-        "_programs/sparsity/pattern.py",
-        "known[0].astype(int).ravel() == k - 1",
-        "known[0].astype(int).ravel() != k - 1",
-        "The pattern of a choice that is known is that of the other case.",
-        of("large_systems", "columns"),
-    ),
-    Fault(
         "rewriting: repeated places",
         "_programs/one_function/rewriting.py",
         "    before = np.arange(to.size) - np.searchsorted(to, to)\n",
@@ -186,14 +178,6 @@ FAULTS = (
         of("saving"),
     ),
     Fault(
-        "controller: the error of rejected steps",
-        "_run/controller.py",
-        "            error=choose(error, memory.error),\n",
-        "            error=error,\n",
-        "The controller compares with the error of a step that was rejected.",
-        of("adaptive"),
-    ),
-    Fault(
         "controller: a mean of a mean",
         "_run/controller.py",
         "jnp.sqrt(jnp.mean(off**2))",
@@ -248,14 +232,6 @@ FAULTS = (
         "is_smooth=error(smooth) >= error(last)",
         "Steps begin from the worse of two guesses.",
         of("step", "energy"),
-    ),
-    Fault(
-        "prediction: steps of another length",
-        "_run/prediction.py",
-        "rates = x[:, 0] / a, x[:, 1] / b, x[:, 2] / c",
-        "rates = x[:, 0] / a, x[:, 1] / a, x[:, 2] / a",
-        "The guess of a step takes the steps before it for equally long.",
-        of("adaptive"),
     ),
     Fault(
         "dense output: a stale time",

@@ -189,28 +189,12 @@ FAULTS = (
         of("forces"),
     ),
     Fault(
-        "decaying: a predictor of the wrong sign",
-        "schemes/_discontinuous.py",
-        "(-problem.h / 6 * acceleration,)",
-        "(problem.h / 6 * acceleration,)",
-        "The first guess of the jump goes the wrong way; the solution does not.",
-        of("energy", "step"),
-    ),
-    Fault(
         "kappa: only one bound",
         "schemes/kappa_decaying.py",
         "((kappa > 0) & (kappa < 2))",
         "(kappa < 2)",
         "A step with a negative kappa is a success.",
         of("failures", "energy"),
-    ),
-    Fault(
-        "kappa: multipliers of the end",
-        "schemes/kappa_decaying.py",
-        "to_end = _scaled(kappa, after, 0.5 * (reaction_jump + reaction_end))",
-        "to_end = _scaled(kappa, after, reaction_end)",
-        "With a Hamiltonian the velocity-level multipliers are not interpolated.",
-        of("general_energies", "energy"),
     ),
     Fault(
         "consistent: the skew gradient does work on drives",

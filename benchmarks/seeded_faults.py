@@ -112,9 +112,8 @@ def _copied(folder: Path) -> Path:
 
 
 def _environment(copy: Path) -> dict[str, str]:
-    """Of tests on the copy. Bytecode of one fault must not be taken for that of another."""
-    own = dict(PYTHONPATH=str(copy / "src"), PYTHONDONTWRITEBYTECODE="1")
-    return os.environ | own
+    """Of tests on the copy."""
+    return os.environ | dict(PYTHONPATH=str(copy / "src"))
 
 
 def tried(fault: Fault, copy: Path, *, everything: bool) -> Finding:
