@@ -19,7 +19,7 @@ FAULTS = (
         "None, length=4)",
         "None, length=2)",
         "In nearly singular poses known velocities are kept to 1e-11 only.",
-        of("initial", "scene_starts"),
+        of("initial"),
     ),
     Fault(
         "projection: one correction of momenta",
@@ -35,7 +35,7 @@ FAULTS = (
         "    multipliers = size * tension / scales.constraint\n",
         "    multipliers = size * tension\n",
         "Multipliers of an equilibrium lack the unit of their constraint.",
-        of("analysis", "scene_starts"),
+        of("analysis"),
     ),
     Fault(
         "equilibrium: no time",
@@ -43,7 +43,7 @@ FAULTS = (
         "lambda q: model.constraint(q, guess.t), q)",
         "lambda q: model.constraint(q, jax.tree.map(jnp.zeros_like, guess.t)), q)",
         "An equilibrium at a time holds drives where they are at time zero.",
-        of("analysis", "scene_drives"),
+        of("analysis"),
     ),
     Fault(
         "modes: no geometric stiffness",
@@ -59,7 +59,7 @@ FAULTS = (
         "    rows = [*first, *(k for k in range(len(scaled)) if k not in set(first))]\n",
         "    rows = list(range(len(scaled)))\n",
         "Rows within bodies are named as redundant instead of those of joints.",
-        of("redundant", "analysis"),
+        of("redundant"),
     ),
     # Scenes -----------------------------------------------------------------------------
     Fault(
@@ -68,7 +68,7 @@ FAULTS = (
         "axis = 0 if apart.size == 2 else 2",
         "axis = 0 if apart.size == 2 else 1",
         "How far a slider in space is, is measured across its axis.",
-        of("scene_drives", "scene_servos"),
+        of("scene_servos"),
     ),
     Fault(
         "inertia: products are left out",
@@ -76,7 +76,7 @@ FAULTS = (
         "0.5 * jnp.sum(moments * (rates @ rates.T))",
         "0.5 * jnp.sum(moments * jnp.eye(3, dtype=v.dtype) * (rates @ rates.T))",
         "Bodies in directors forget the products of inertia of a given matrix.",
-        of("joints", "scenes", "spatial_problems"),
+        of("scene_starts", "spatial_problems"),
     ),
     Fault(
         "bodies: angular velocity in body axes",
@@ -84,7 +84,7 @@ FAULTS = (
         "v[3:] @ matrix",
         "matrix @ v[3:]",
         "The angular velocity of a turned body in quaternions is turned the wrong way.",
-        of("scene_starts", "joints", "scenes"),
+        of("scene_starts"),
     ),
     Fault(
         "rotations: the quaternion of a large turn",
@@ -92,7 +92,7 @@ FAULTS = (
         "m + m.T + (1 - trace) * np.eye(3)",
         "m + m.T - (1 - trace) * np.eye(3)",
         "Rotations by more than two thirds of a half turn have a wrong quaternion.",
-        of("scenes", "scene_starts"),
+        of("scene_starts"),
     ),
     Fault(
         "hinges: all joints share every axis",
@@ -116,7 +116,7 @@ FAULTS = (
         'law, start = Elastic(PlanarTurn(), "angle"), ends.turn()',
         'law, start = Elastic(PlanarTurn(), "angle"), 0.0 * ends.turn()',
         "A torsion spring in the plane is relaxed at angle zero and not at the start.",
-        of("scenes", "scene_forces"),
+        of("scenes"),
     ),
     Fault(
         "drives: half a turn is not missed",
@@ -124,7 +124,7 @@ FAULTS = (
         "        return jnp.arctan2(across, along).reshape(-1)\n",
         "        return across.reshape(-1)\n",
         "A driven angle in space may start half a turn away from its value.",
-        of("scene_drives", "bad_scenes", "scene_starts"),
+        of("bad_scenes"),
     ),
     Fault(
         "measures: the force of a rod",
@@ -140,7 +140,7 @@ FAULTS = (
         "    mean = 0.5 * (found.rate[..., 1:] + found.rate[..., :-1])\n",
         "    mean = found.rate[..., :-1]\n",
         "Turns between rows are counted with the rate at the row before.",
-        of("scene_servos", "scene_drives"),
+        of("scene_servos"),
     ),
     Fault(
         "reactions: torque about the mass centre",
@@ -148,7 +148,7 @@ FAULTS = (
         "    pivot = pivot_of(b, numbers)\n",
         "    pivot = b.origin\n",
         "The torque of a joint is that about the mass centre of its second body.",
-        of("joints", "scene_starts"),
+        of("joints"),
     ),
     Fault(
         "gaps: an arc in another unit",
@@ -156,7 +156,7 @@ FAULTS = (
         "turn / size",
         "turn * size",
         "A gap in an angle is measured in the wrong unit.",
-        of("scenes", "scene_starts"),
+        of("scenes"),
     ),
     # Problems ---------------------------------------------------------------------------
     Fault(
@@ -165,7 +165,7 @@ FAULTS = (
         'args["m"] * args["g"] * q[2]',
         '-args["m"] * args["g"] * q[2]',
         "Gravity pulls the elastic pendulum upwards; all that it conserves stays.",
-        of("problems", "momenta"),
+        of("problems"),
     ),
     # Tools ------------------------------------------------------------------------------
     Fault(

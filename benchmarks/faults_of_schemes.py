@@ -128,7 +128,7 @@ FAULTS = (
         "h**2 / masses",
         "1 / masses",
         "The correction measures momenta in another unit than positions.",
-        of("general_energies", "audit"),
+        of("general_energies"),
     ),
     Fault(
         "scaling: the size of a backward stage",
@@ -136,7 +136,7 @@ FAULTS = (
         "scales.constraint_size / jnp.abs(h)",
         "scales.constraint_size / h",
         "In backward stages of a composition constraints have a negative size.",
-        of("orders", "step"),
+        of("step"),
     ),
     Fault(
         "phase: the constant of the fourth order",
@@ -194,7 +194,7 @@ FAULTS = (
         "((kappa > 0) & (kappa < 2))",
         "(kappa < 2)",
         "A step with a negative kappa is a success.",
-        of("failures", "energy"),
+        of("failures"),
     ),
     Fault(
         "consistent: the skew gradient does work on drives",
@@ -218,7 +218,7 @@ FAULTS = (
         "    half_way = start.q + 0.5 * h * model.lift(start.q, start.v)\n",
         "    half_way = start.q\n",
         "The dissipative stiffness is that of the start: the order of the decay is lower.",
-        of("orders", "energy"),
+        of("orders"),
     ),
     Fault(
         "consistent: derivative of an indefinite stiffness",
@@ -226,7 +226,7 @@ FAULTS = (
         "    mixed = (rows > 0) != (columns > 0)\n",
         "    mixed = (rows > 0) & (columns < -jnp.inf)\n",
         "Derivatives are wrong where a stiffness has eigenvalues of both signs.",
-        of("gradients", "fuzz"),
+        of("gradients"),
     ),
     Fault(
         "rattle: multipliers of the start",
@@ -234,7 +234,7 @@ FAULTS = (
         "0.5 * (z.impulse + z.velocity_impulse) / problem.h",
         "z.impulse / problem.h",
         "The multipliers that are reported are those of the start of the step.",
-        of("baselines", "step"),
+        of("baselines"),
     ),
     Fault(
         "generalized alpha: the method of HHT",
