@@ -11,7 +11,7 @@ FAULTS = (
         "        force = metric @ shift + pull(mu)[0]\n        return force / (size",
         "        force = coordinate**2 * shift + pull(mu)[0]\n        return force / (size",
         "A start moves by the smallest change in the diagonal of the inertia only.",
-        of("initial"),
+        of("initial::test_the_smallest_change_in_an_inertia_that_couples_the_coordinates"),
     ),
     Fault(
         "projection: two corrections of known velocities",
@@ -19,7 +19,7 @@ FAULTS = (
         "None, length=4)",
         "None, length=2)",
         "In nearly singular poses known velocities are kept to 1e-11 only.",
-        of("initial"),
+        of("initial::test_known_velocities_are_kept_in_a_nearly_singular_pose"),
     ),
     Fault(
         "projection: one correction of momenta",
@@ -27,7 +27,7 @@ FAULTS = (
         "8 if isinstance(model.system, HamiltonianSystem) else 1",
         "1",
         "Momenta whose energy is not quadratic do not satisfy the velocity level.",
-        of("general_energies"),
+        of("general_energies::test_a_relativistic_start_is_made_consistent"),
     ),
     Fault(
         "equilibrium: multipliers in another unit",
@@ -35,7 +35,7 @@ FAULTS = (
         "    multipliers = size * tension / scales.constraint\n",
         "    multipliers = size * tension\n",
         "Multipliers of an equilibrium lack the unit of their constraint.",
-        of("analysis"),
+        of("analysis::test_a_hanging_chain_rests_in_the_catenary_polygon"),
     ),
     Fault(
         "equilibrium: no time",
@@ -43,7 +43,7 @@ FAULTS = (
         "lambda q: model.constraint(q, guess.t), q)",
         "lambda q: model.constraint(q, jax.tree.map(jnp.zeros_like, guess.t)), q)",
         "An equilibrium at a time holds drives where they are at time zero.",
-        of("analysis"),
+        of("analysis::test_drives_stand_where_they_are_at_the_time"),
     ),
     Fault(
         "modes: no geometric stiffness",
@@ -51,7 +51,7 @@ FAULTS = (
         "    strain = lambda q: energy(q) + multipliers @ held(q)\n",
         "    strain = lambda q: energy(q) + 0 * multipliers @ held(q)\n",
         "Tensions of rods do not stiffen a hanging chain.",
-        of("analysis"),
+        of("analysis::test_modes_of_a_hanging_chain"),
     ),
     Fault(
         "mobility: the order of the rows",
@@ -59,7 +59,7 @@ FAULTS = (
         "    rows = [*first, *(k for k in range(len(scaled)) if k not in set(first))]\n",
         "    rows = list(range(len(scaled)))\n",
         "Rows within bodies are named as redundant instead of those of joints.",
-        of("redundant"),
+        of("redundant::test_a_repeated_hinge_is_the_one_that_is_redundant"),
     ),
     # Scenes -----------------------------------------------------------------------------
     Fault(
@@ -68,7 +68,7 @@ FAULTS = (
         "axis = 0 if apart.size == 2 else 2",
         "axis = 0 if apart.size == 2 else 1",
         "How far a slider in space is, is measured across its axis.",
-        of("scene_servos"),
+        of("scene_servos::test_lengths_and_forces_are_those_by_hand"),
     ),
     Fault(
         "inertia: products are left out",
@@ -76,7 +76,7 @@ FAULTS = (
         "0.5 * jnp.sum(moments * (rates @ rates.T))",
         "0.5 * jnp.sum(moments * jnp.eye(3, dtype=v.dtype) * (rates @ rates.T))",
         "Bodies in directors forget the products of inertia of a given matrix.",
-        of("scene_starts", "spatial_problems"),
+        of("scene_starts::test_a_body_in_space_starts_as_it_is_told"),
     ),
     Fault(
         "bodies: angular velocity in body axes",
@@ -84,15 +84,15 @@ FAULTS = (
         "v[3:] @ matrix",
         "matrix @ v[3:]",
         "The angular velocity of a turned body in quaternions is turned the wrong way.",
-        of("scene_starts"),
+        of("scene_starts::test_a_body_in_space_starts_as_it_is_told"),
     ),
     Fault(
-        "rotations: the quaternion of a large turn",
+        "rotations: the quaternion of half a turn",
         "scenes/_rotations.py",
         "m + m.T + (1 - trace) * np.eye(3)",
         "m + m.T - (1 - trace) * np.eye(3)",
-        "Rotations by more than two thirds of a half turn have a wrong quaternion.",
-        of("scene_starts"),
+        "A rotation by half a turn has no quaternion.",
+        of("scene_starts::test_a_body_in_space_starts_as_it_is_told"),
     ),
     Fault(
         "hinges: all joints share every axis",
@@ -100,7 +100,10 @@ FAULTS = (
         "        return float(np.linalg.norm(np.cross(self.axis, axis))) <= _PARALLEL\n",
         "        return True\n",
         "An angle about an axis that a hinge does not keep is accepted.",
-        of("scene_starts", "bad_scenes"),
+        of(
+            "scene_starts::test_an_axis_is_common_along_a_shaft_of_several_hinges",
+            "bad_scenes",
+        ),
     ),
     Fault(
         "forces: a follower that does not follow",
@@ -108,7 +111,7 @@ FAULTS = (
         '        return b.direction(numbers["value"])\n',
         '        return numbers["value"]\n',
         "A force that turns with its body keeps its direction in space.",
-        of("scene_forces"),
+        of("scene_forces::test_forces_that_a_program_gives_follow_their_closed_forms"),
     ),
     Fault(
         "springs: the angle of rest in the plane",
@@ -116,7 +119,7 @@ FAULTS = (
         'law, start = Elastic(PlanarTurn(), "angle"), ends.turn()',
         'law, start = Elastic(PlanarTurn(), "angle"), 0.0 * ends.turn()',
         "A torsion spring in the plane is relaxed at angle zero and not at the start.",
-        of("scenes"),
+        of("scenes::test_forces_have_the_energies_that_they_say"),
     ),
     Fault(
         "drives: half a turn is not missed",
@@ -132,7 +135,7 @@ FAULTS = (
         "slope = 2 * found.value if",
         "slope = found.value if",
         "The force of a rod is half of what it is.",
-        of("scene_servos"),
+        of("scene_servos::test_lengths_and_forces_are_those_by_hand"),
     ),
     Fault(
         "measures: turns between rows",
@@ -140,7 +143,7 @@ FAULTS = (
         "    mean = 0.5 * (found.rate[..., 1:] + found.rate[..., :-1])\n",
         "    mean = found.rate[..., :-1]\n",
         "Turns between rows are counted with the rate at the row before.",
-        of("scene_servos"),
+        of("scene_servos::test_a_hinge_in_space_counts_its_turns"),
     ),
     Fault(
         "reactions: torque about the mass centre",
@@ -148,7 +151,7 @@ FAULTS = (
         "    pivot = pivot_of(b, numbers)\n",
         "    pivot = b.origin\n",
         "The torque of a joint is that about the mass centre of its second body.",
-        of("joints"),
+        of("joints::test_a_joint_leaves_its_own_freedom_and_carries_the_rest"),
     ),
     Fault(
         "gaps: an arc in another unit",
@@ -156,7 +159,7 @@ FAULTS = (
         "turn / size",
         "turn * size",
         "A gap in an angle is measured in the wrong unit.",
-        of("scenes"),
+        of("scenes::test_what_is_off_a_little_is_reported_and_closed"),
     ),
     # Problems ---------------------------------------------------------------------------
     Fault(
@@ -165,7 +168,7 @@ FAULTS = (
         'args["m"] * args["g"] * q[2]',
         '-args["m"] * args["g"] * q[2]',
         "Gravity pulls the elastic pendulum upwards; all that it conserves stays.",
-        of("problems"),
+        of("problems::test_energies_of_the_starts_are_the_published_ones"),
     ),
     # Tools ------------------------------------------------------------------------------
     Fault(
@@ -174,7 +177,7 @@ FAULTS = (
         "        tell(checksum([const]))\n",
         "        tell(np.shape(const))\n",
         "Sweeps that differ in a table of constants are taken for the same.",
-        of("sweep_resume"),
+        of("sweep_resume::test_settings_that_no_shape_tells_make_another_sweep"),
     ),
     Fault(
         "sweeps: axes that move",
@@ -182,7 +185,7 @@ FAULTS = (
         "for axis, names in reversed(list(enumerate(self.axes))):",
         "for axis, names in list(enumerate(self.axes)):",
         "A choice along two axes takes the second one from another axis.",
-        of("sweep"),
+        of("sweep::test_selection_by_value"),
     ),
     Fault(
         "fits: covariance of logarithms",
@@ -190,7 +193,7 @@ FAULTS = (
         "covariance=slopes[:, None] * spread * slopes[None]",
         "covariance=spread",
         "The covariance of positive parameters is that of their logarithms.",
-        of("identification"),
+        of("identification::test_estimate_and_covariance_of_an_independent_program"),
     ),
     Fault(
         "fits: a one-sided interval",
@@ -198,7 +201,10 @@ FAULTS = (
         "0.5 + CONFIDENCE / 2",
         "CONFIDENCE",
         "Intervals hold 90 % instead of 95 %.",
-        of("identification"),
+        of(
+            "identification::test_estimate_and_covariance_of_an_independent_program",
+            "identification::test_intervals_hold_what_they_promise",
+        ),
     ),
     Fault(
         "orders: the gain of an extrapolation",
@@ -206,6 +212,6 @@ FAULTS = (
         "(_FINER[1] / _FINER[0]) ** order - 1",
         "(_FINER[1] / _FINER[0]) ** order",
         "Richardson's extrapolation stops short.",
-        of("measure"),
+        of("measure::test_the_extrapolated_reference_is_as_good_as_given_data"),
     ),
 )

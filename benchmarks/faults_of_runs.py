@@ -11,7 +11,7 @@ FAULTS = (
         "jnp.where(sizes == jnp.max(sizes), numbers, num_rows - 1)",
         "jnp.where(sizes > 0, numbers, num_rows - 1)",
         "The elimination of narrow bands takes the first pivot that is not zero.",
-        of("simplified_search", "large_systems"),
+        of("large_systems::test_a_shuffled_band_is_found_and_solved"),
     ),
     Fault(
         "band: colours of a dense matrix",
@@ -19,7 +19,7 @@ FAULTS = (
         "        return jnp.where(self._filled, columns, 0)\n",
         "        return columns\n",
         "Full Jacobians whose columns are found together have entries of other columns.",
-        of("simplified_search", "large_systems"),
+        of("elements::test_a_net_with_loops"),
     ),
     Fault(
         "inverse: pivots with their sign",
@@ -27,7 +27,7 @@ FAULTS = (
         "sizes = jnp.where(free, jnp.abs(entries), -1)",
         "sizes = jnp.where(free, entries**1, -jnp.inf)",
         "The inverse of a small matrix takes the most positive entry for its pivot.",
-        of("inverses"),
+        of("inverses::test_pivots_are_the_largest_entries"),
     ),
     Fault(
         "blocks: derivative by the matrix",
@@ -35,7 +35,7 @@ FAULTS = (
         "dright - _times(dblocks, x)",
         "dright",
         "Derivatives of solves with many blocks do not see that the blocks change.",
-        of("parts"),
+        of("parts::test_derivatives_of_solutions"),
     ),
     Fault(
         "regularisation: an open part that stands still",
@@ -43,7 +43,7 @@ FAULTS = (
         "change + _turned(linear, flat_fn, flat, (moved, fixed), t_args)",
         "change",
         "Derivatives of multipliers of least norm miss how their null space turns.",
-        of("redundant"),
+        of("redundant::test_derivatives_of_multipliers_of_least_norm"),
     ),
     Fault(
         "root: derivative at the guess",
@@ -52,7 +52,10 @@ FAULTS = (
         "    _, rate = jax.jvp(by_args, (moved,), (t_args,))\n"
         "    flat = ravel_pytree(start.guess)[0]\n    given",
         "Derivatives of a root solve with the Jacobian at the first guess.",
-        of("gradients"),
+        of(
+            "gradients::test_derivatives_of_a_free_oscillator",
+            "gradients::test_the_start_moves_along_the_constraints",
+        ),
     ),
     Fault(
         "newton: half of the digits are round-off",
@@ -60,7 +63,10 @@ FAULTS = (
         "        tiny=eps**0.75,\n",
         "        tiny=eps**0.5,\n",
         "A small correction that does not shrink ends a search at a residual of 1e-8.",
-        of("extremes", "simplified_search"),
+        of(
+            "simplified_search::test_slow_corrections_are_not_taken_for_round_off",
+            "extremes",
+        ),
     ),
     Fault(
         "newton: a lucky correction is believed",
@@ -68,7 +74,7 @@ FAULTS = (
         "rate = jnp.maximum(jnp.maximum(contraction, iterate.contraction), iterate.size)",
         "rate = contraction",
         "One accidental contraction is taken for that of all corrections to come.",
-        of("energy"),
+        of("energy::test_every_step_changes_the_energy_by_what_it_reports_as_dissipated"),
     ),
     Fault(
         "eigenvectors: three sweeps",
@@ -76,7 +82,7 @@ FAULTS = (
         "_SWEEPS = 15",
         "_SWEEPS = 3",
         "Eigenvalues of symmetric matrices are not converged.",
-        of("analysis"),
+        of("analysis::test_modes_of_a_ring_of_springs"),
     ),
     Fault(
         "cholesky: derivative of the diagonal",
@@ -84,7 +90,7 @@ FAULTS = (
         "half = 0.5 * jnp.eye(",
         "half = jnp.eye(",
         "Derivatives of the root of the inertia are wrong on its diagonal.",
-        of("gradients"),
+        of("gradients::test_forward_reverse_and_differences_agree"),
     ),
     # Programs ---------------------------------------------------------------------------
     Fault(
@@ -93,7 +99,7 @@ FAULTS = (
         "    return [_rows(operand, width) + joined]\n",
         "    return [joined]\n",
         "The pattern of `x.at[index].add(y)` misses the dependence on `x`.",
-        of("large_systems"),
+        of("large_systems::test_the_pattern_covers_the_jacobian"),
     ),
     Fault(
         "rewriting: repeated places",
@@ -101,7 +107,7 @@ FAULTS = (
         "    before = np.arange(to.size) - np.searchsorted(to, to)\n",
         "    before = np.zeros(to.size, int)\n",
         "Of several numbers that are added to one place only the last is.",
-        of("rewriting"),
+        of("rewriting::test_values_and_derivatives"),
     ),
     Fault(
         "rewriting: places that are clipped",
@@ -110,7 +116,7 @@ FAULTS = (
         "        first = np.clip(first, 0, room)\n",
         "",
         "A scatter beyond the end is dropped where it should be moved to the end.",
-        of("rewriting"),
+        of("rewriting::test_values_and_derivatives"),
     ),
     Fault(
         "rewriting: a scan that goes backwards",
@@ -118,7 +124,7 @@ FAULTS = (
         '("length", "reverse", "unroll")',
         '("length", "unroll")',
         "A reversed scan with a product of matrices inside goes forwards.",
-        of("rewriting", "one_function"),
+        of("rewriting::test_values_and_derivatives"),
     ),
     Fault(
         "lanes: all instead of any",
@@ -126,7 +132,7 @@ FAULTS = (
         "jnp.any(flags, axis=0)",
         "jnp.all(flags, axis=0)",
         "What one lane needs is done only where all lanes need it.",
-        of("halvings"),
+        of("halvings::test_lanes_are_halved_on_their_own"),
     ),
     # Runs -------------------------------------------------------------------------------
     Fault(
@@ -135,7 +141,7 @@ FAULTS = (
         "live & (first + k < count)",
         "live & (first + k <= count)",
         "A group of steps that is cut into segments can take one step more.",
-        of("saving"),
+        of("saving::test_the_end_is_a_row_where_the_steps_do_not_fill_the_last_one"),
     ),
     Fault(
         "loop: energies of rejected steps",
@@ -143,7 +149,7 @@ FAULTS = (
         "energies=jax.tree.map(lambda x: zero_unless(good, x), out.energies)",
         "energies=jax.tree.map(lambda x: zero_unless(live, x), out.energies)",
         "The account of a row counts the energies of steps that were rejected.",
-        of("adaptive"),
+        of("adaptive::test_the_energy_balance_holds_at_round_off_while_steps_vary"),
     ),
     Fault(
         "start: velocities are not checked",
@@ -151,7 +157,7 @@ FAULTS = (
         "        bad = bad | jnp.any(fast)\n",
         "",
         "A start whose velocities break the joints is accepted.",
-        of("failures"),
+        of("failures::test_an_inconsistent_start_is_a_failure_of_the_first_step"),
     ),
     Fault(
         "saving: costs of rejected steps",
@@ -159,7 +165,7 @@ FAULTS = (
         "    return jnp.cumsum(reached) - reached\n",
         "    return jnp.cumsum(reached)\n",
         "Rows of a run with a controller count the steps that follow them.",
-        of("saving", "adaptive"),
+        of("saving::test_every_accepted_step_of_a_controller_is_counted"),
     ),
     Fault(
         "saving: energies one row off",
@@ -167,7 +173,7 @@ FAULTS = (
         'segment = jnp.searchsorted(done, _number_of_step(record), side="right")',
         'segment = jnp.searchsorted(done, _number_of_step(record), side="left")',
         "Rows at requested times count the energies of a step too late.",
-        of("saving", "adaptive"),
+        of("saving"),
     ),
     Fault(
         "saving: the last row",
@@ -175,7 +181,7 @@ FAULTS = (
         "        is_used = numbers - self.every < plan.last\n",
         "        is_used = numbers <= plan.last\n",
         "A last row that holds fewer steps than the others has no time.",
-        of("saving"),
+        of("saving::test_the_end_is_a_row_where_the_steps_do_not_fill_the_last_one"),
     ),
     Fault(
         "controller: a mean of a mean",
@@ -183,7 +189,7 @@ FAULTS = (
         "jnp.sqrt(jnp.mean(off**2))",
         "jnp.sqrt(jnp.mean(off**2) / off.size)",
         "The error of a step is smaller by the root of the number of entries.",
-        of("adaptive"),
+        of("adaptive::test_the_estimate_tends_to_the_error_of_a_step"),
     ),
     Fault(
         "step sizes: round-off of a quotient",
@@ -191,7 +197,7 @@ FAULTS = (
         "numbers.ceil(steps - rounding * (steps + size))",
         "numbers.ceil(steps)",
         "A run of 0.3 in steps of 0.1 takes a fourth step.",
-        of("end_time"),
+        of("end_time::test_a_decimal_length_takes_no_step_more"),
     ),
     Fault(
         "halving: a stale time",
@@ -215,7 +221,7 @@ FAULTS = (
         "        multipliers=lengths @ multipliers,\n",
         "        multipliers=multipliers[-1],\n",
         "The multipliers of a composition are those of its last stage.",
-        of("step"),
+        of("step::test_multipliers_of_a_run_are_the_force_in_the_rod"),
     ),
     Fault(
         "step: what rounding has withheld",
@@ -223,7 +229,7 @@ FAULTS = (
         "_sum_and_rest(state.q, end.displacement + rest)",
         "_sum_and_rest(state.q, end.displacement + 0 * rest)",
         "Rounding errors of bodies far from the origin accumulate.",
-        of("step"),
+        of("extremes", "step"),
     ),
     Fault(
         "prediction: extrapolation where it is worse",
@@ -231,7 +237,10 @@ FAULTS = (
         "is_smooth=error(smooth) <= error(last)",
         "is_smooth=error(smooth) >= error(last)",
         "Steps begin from the worse of two guesses.",
-        of("step"),
+        of(
+            "step::test_memory_of_the_steps_before_saves_iterations_and_changes_nothing",
+            "energy::test_newton_needs_few_iterations",
+        ),
     ),
     Fault(
         "dense output: a stale time",
@@ -239,7 +248,7 @@ FAULTS = (
         "    t = None if a.t is None else a.t + part * h\n",
         "    t = None if a.t is None else a.t\n",
         "States within a step satisfy driven constraints at the time of its start.",
-        of("end_time"),
+        of("end_time::test_rows_within_steps_have_the_order_of_the_scheme"),
     ),
     Fault(
         "dense output: no turns",
@@ -247,7 +256,7 @@ FAULTS = (
         "max(order - 4, 0)",
         "0",
         "States within a step of order 6 or 8 have order 4.",
-        of("end_time"),
+        of("end_time::test_rows_within_steps_have_the_order_of_the_scheme"),
     ),
     Fault(
         "audit: the largest leak",
@@ -255,6 +264,6 @@ FAULTS = (
         '("  unaccounted for (largest row)", largest(audit.leak))',
         '("  unaccounted for (largest row)", largest(jnp.sum(audit.leak)))',
         "The printed largest leak is the sum of leaks that may cancel.",
-        of("audit"),
+        of("audit::test_an_audit_tells_itself_in_short"),
     ),
 )

@@ -10,8 +10,8 @@ class Fault(NamedTuple):
     - `file`: below `src/enerjax`.
     - `old`, `new`: a text that the file holds just once, and the mistake in its place.
     - `wrong`: what is wrong, in one sentence.
-    - `tests`: the files that ought to notice, below the root of the project, most
-      likely first.
+    - `tests`: what ought to notice, test files or tests in them, below the root of the
+      project.
     """
 
     name: str
@@ -23,5 +23,6 @@ class Fault(NamedTuple):
 
 
 def of(*names: str) -> tuple[str, ...]:
-    """The paths of test files."""
-    return tuple(f"tests/test_{name}.py" for name in names)
+    """Where tests are: of a file `"energy"`, of one of its tests `"energy::test_..."`."""
+    places = [name.partition("::") for name in names]
+    return tuple(f"tests/test_{file}.py{mark}{test}" for file, mark, test in places)

@@ -68,12 +68,12 @@ def test_velocities_that_no_joint_allows_are_refused():
     np.testing.assert_allclose(rounded, [0.0, 1.0075, 2.015], rtol=0, atol=1e-14)
 
 
-# Less than a right angle, and more than 120 degrees about axes near x, y and z.
+# Quaternions, of any length; half a turn has no scalar part.
 TURNS = [
     [0.3, -0.2, 0.5, 0.4],
-    [1.0, -4.0, 1.2, 0.5],
-    [-0.5, 0.3, 2.0, 0.4],
-    [0.2, 0.3, -0.5, 2.0],
+    [0.0, -4.0, 1.2, 0.5],
+    [0.0, 0.3, 2.0, 0.4],
+    [1e-9, 0.3, -0.5, 2.0],
 ]
 
 
