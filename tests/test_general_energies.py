@@ -168,6 +168,9 @@ def test_a_relativistic_start_is_made_consistent():
     start = ej.initial_state(system, [0.6, 0.8], [0.7, 0.2])
     assert float(start.q @ start.v) == pytest.approx(0, abs=1e-14)  # round-off
     assert float(start.v @ start.v) > 0.01
+    # From here Newton's method diverges.
+    with pytest.raises(ValueError, match="too far from the constraints"):
+        ej.initial_state(system, [0.6, 0.8], [2.0, 1.5])
 
 
 BAD = [
