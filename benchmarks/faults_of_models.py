@@ -68,7 +68,7 @@ FAULTS = (
         "axis = 0 if apart.size == 2 else 2",
         "axis = 0 if apart.size == 2 else 1",
         "How far a slider in space is, is measured across its axis.",
-        of("scene_servos::test_lengths_and_forces_are_those_by_hand"),
+        of("scene_servos::test_lengths_along_an_axis_in_space"),
     ),
     Fault(
         "inertia: products are left out",

@@ -43,7 +43,7 @@ FAULTS = (
         "change + _turned(linear, flat_fn, flat, (moved, fixed), t_args)",
         "change",
         "Derivatives of multipliers of least norm miss how their null space turns.",
-        of("redundant::test_derivatives_of_multipliers_of_least_norm"),
+        of("redundant::test_derivatives_of_forces_that_turn_against_each_other"),
     ),
     Fault(
         "root: derivative at the guess",

@@ -194,7 +194,7 @@ FAULTS = (
         "((kappa > 0) & (kappa < 2))",
         "(kappa < 2)",
         "A step with a negative kappa is a success.",
-        of("failures::test_a_failure_is_reported_at_the_step_where_it_happens"),
+        of("failures::test_a_negative_kappa_is_a_failure_too"),
     ),
     Fault(
         "consistent: the skew gradient does work on drives",
@@ -202,7 +202,7 @@ FAULTS = (
         "            drive_work = drive_work - h / 12 * skew_work\n",
         "",
         "The account of the drives misses what the skew gradient takes.",
-        of("driven::test_the_audit_adds_up_with_the_work_of_the_drive"),
+        of("driven::test_a_pendulum_on_a_moving_pivot"),
     ),
     Fault(
         "consistent: undamped jumps of momenta",
