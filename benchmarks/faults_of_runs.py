@@ -229,7 +229,7 @@ FAULTS = (
         "_sum_and_rest(state.q, end.displacement + rest)",
         "_sum_and_rest(state.q, end.displacement + 0 * rest)",
         "Rounding errors of bodies far from the origin accumulate.",
-        of("extremes", "step"),
+        of("step::test_rounding_errors_far_from_the_origin_do_not_add_up"),
     ),
     Fault(
         "prediction: extrapolation where it is worse",
@@ -248,7 +248,7 @@ FAULTS = (
         "    t = None if a.t is None else a.t + part * h\n",
         "    t = None if a.t is None else a.t\n",
         "States within a step satisfy driven constraints at the time of its start.",
-        of("end_time::test_rows_within_steps_have_the_order_of_the_scheme"),
+        of("driven::test_both_levels_hold_within_steps_too"),
     ),
     Fault(
         "dense output: no turns",

@@ -157,7 +157,7 @@ def _tested(copy: Path, arguments: list[str], limit: float) -> tuple[str, str]:
         return "no verdict", ""
     if process.returncode == 0:
         return "survived", ""
-    first = re.search(r"^(?:FAILED|ERROR) (?:tests/)?(\S+)", out, re.MULTILINE)
+    first = re.search(r"^(?:FAILED|ERROR) (?:tests/)?(.+?)(?: - .*)?$", out, re.MULTILINE)
     if first is not None:
         return "caught", first[1]
     if process.returncode < 0:  # XLA can end the whole process
