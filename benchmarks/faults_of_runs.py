@@ -173,7 +173,7 @@ FAULTS = (
         'segment = jnp.searchsorted(done, _number_of_step(record), side="right")',
         'segment = jnp.searchsorted(done, _number_of_step(record), side="left")',
         "Rows at requested times count the energies of a step too late.",
-        of("saving"),
+        of("saving::test_a_number_of_steps_has_rows_at_times_too"),
     ),
     Fault(
         "saving: the last row",

@@ -172,7 +172,8 @@ def test_lengths_along_an_axis_in_space():
         args=dict(far=axis @ away),
     )
     start = scene.start()
-    for name, value, rate in (("guide", 0.7, 1.5), ("ram", axis @ away, 3 * axis @ away)):
+    far = float(axis @ away)
+    for name, value, rate in (("guide", 0.7, 1.5), ("ram", far, 3 * far)):
         seen = scene.measure(start, name)
         # Round-off.
         np.testing.assert_allclose([seen.value, seen.rate], [value, rate], rtol=1e-13)
