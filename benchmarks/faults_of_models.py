@@ -177,7 +177,7 @@ FAULTS = (
         "        tell(checksum([const]))\n",
         "        tell(np.shape(const))\n",
         "Sweeps that differ in a table of constants are taken for the same.",
-        of("sweep_resume::test_settings_that_no_shape_tells_make_another_sweep"),
+        of("sweep_resume::test_another_sweep_is_not_resumed"),
     ),
     Fault(
         "sweeps: axes that move",
