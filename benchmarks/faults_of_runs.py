@@ -141,7 +141,7 @@ FAULTS = (
         "live & (first + k < count)",
         "live & (first + k <= count)",
         "A group of steps that is cut into segments can take one step more.",
-        of("saving::test_the_end_is_a_row_where_the_steps_do_not_fill_the_last_one"),
+        of("saving::test_rows_of_a_prime_number_of_steps"),
     ),
     Fault(
         "loop: energies of rejected steps",

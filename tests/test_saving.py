@@ -43,6 +43,13 @@ def test_the_end_is_a_row_where_the_steps_do_not_fill_the_last_one():
     np.testing.assert_allclose(thin.stats.local_error, estimates, rtol=1e-6)
 
 
+def test_rows_of_a_prime_number_of_steps():
+    """The steps of a row are cut into segments of equal length, which 31 has not."""
+    thin, full = (run(ej.SaveAt(every=k), num_steps=62) for k in (31, 1))
+    # Round-off: another program.
+    np.testing.assert_allclose(thin.ys.q, full.ys.q[::31], rtol=0, atol=100 * EPS)
+
+
 def test_a_function_of_the_state_is_saved_in_its_place():
     height = lambda t, state, args: {"y": args["l"] * state.q[1], "t": t, "row": 1}
     told, full = run(ej.SaveAt(every=8, fn=height)), every_step()
