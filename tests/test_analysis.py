@@ -49,6 +49,10 @@ def test_a_hanging_chain_rests_in_the_catenary_polygon():
     found = ej.equilibrium(system, guess, args)
     np.testing.assert_allclose(found.state.q, _polygon(12, 0.6), atol=1e-12)  # solver
     assert np.all(found.state.v == 0)
+    assert system.constraint is not None
+    pulls = found.multipliers @ jax.jacfwd(system.constraint)(found.state.q, args)
+    weights = np.tile([0.0, 9.81 / 12], 11)
+    np.testing.assert_allclose(pulls, weights, rtol=0, atol=1e-12)  # solver
     # Its derivative along a change of the lengths, by differences.
     sag = lambda l: ej.equilibrium(system, guess, args | {"l": l}).state.q[11]
     step, l = 1e-5, args["l"]
@@ -78,6 +82,23 @@ def test_a_horizontal_arm_comes_to_rest(stiffness):
         jax.jacfwd(moment)(q), jax.jacfwd(jax.grad(springs), argnums=1)(q, stiffness)
     )
     np.testing.assert_allclose(slope, by_hand, rtol=1e-9)  # round-off
+
+
+def test_drives_stand_where_they_are_at_the_time():
+    """A weight on a rod below a pivot that moves."""
+    pivot = lambda t: jnp.stack([jnp.sin(3 * t), 0.2 * t])
+    system = ej.System(
+        jnp.eye(4),
+        lambda q, args: 9.81 * q[3],
+        lambda q, args: jnp.stack([jnp.sum((q[2:] - q[:2]) ** 2) - 1]),
+        driven=lambda q, t, args: q[:2] - pivot(t),
+    )
+    guess = ej.State([0.8, 0.0, 1.2, -0.9], [0.0] * 4)
+    found = ej.equilibrium(system, guess, t=0.4)
+    x, y = pivot(0.4)
+    np.testing.assert_allclose(found.state.q, [x, y, x, y - 1], rtol=0, atol=1e-12)
+    # Solver: the rod, and the pivot, carry the weight.
+    np.testing.assert_allclose(found.multipliers, [9.81 / 2, 0, -9.81], rtol=0, atol=1e-11)
 
 
 def test_a_missing_equilibrium_raises_an_error():

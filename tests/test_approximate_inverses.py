@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import enerjax as ej
-from enerjax._solvers.linear.dense import Inverse
+from enerjax._solvers.linear.dense import Inverse, inverse
 
 from .helpers import EPS
 
@@ -29,6 +29,19 @@ def test_an_inverse_is_improved_or_recomputed(off):
     left = np.asarray(matrix(off) @ new.inverse) / ROWS * ROWS.T - np.eye(SIZE)
     # Truncation: errors of 1e-7 are small enough for a chord iteration.
     assert np.max(np.abs(left)) < 1e-7
+
+
+@pytest.mark.parametrize("size", [2, 3, 6])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_pivots_are_the_largest_entries(size, sign):
+    """Of either sign; with another pivot no digit would be left."""
+    matrix = np.eye(size) + TURN[:size, :size]
+    matrix[:, 0] = sign * np.abs(matrix[:, 0])
+    matrix[0, 0] = -sign * 1e-17
+    # Round-off.
+    exact = np.linalg.inv(matrix)
+    bound = 10 * EPS * np.linalg.cond(matrix) * np.max(np.abs(exact))
+    np.testing.assert_allclose(inverse(jnp.asarray(matrix)), exact, rtol=0, atol=bound)
 
 
 def test_a_singular_matrix_has_no_inverse():

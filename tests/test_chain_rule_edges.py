@@ -60,11 +60,21 @@ def test_tails_keep_their_digits(dtype):
 
 
 A, B = jnp.array([-1.0, 2.0, 3.0]), jnp.array([1.0, 1.0, 2.0])
+
+
+def iterated(q):
+    """Loops have no rule for a choice that was made before them."""
+    choice = q[0] > 0
+    turn = lambda x, _: (jnp.where(choice, jnp.sin(x), x * x), None)
+    return jax.lax.scan(turn, q[1], None, length=2)[0]
+
+
 CHOICES = {
     "cond": lambda q: jax.lax.cond(q[0] > 0, lambda q: jnp.sum(q**4), lambda q: q @ q, q),
     "where": lambda q: jnp.where(q[0] > 0, jnp.sum(q**4), q @ q),
     "index": lambda q: q[jnp.argmin(q)] * q[0],
     "floor": lambda q: jnp.floor(2 * q[0]) * q[1],
+    "loop": iterated,
 }
 
 

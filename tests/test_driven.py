@@ -82,6 +82,24 @@ def test_both_levels_hold_at_the_times_of_the_rows():
     assert np.max(np.abs(run.audit.constraint_rate)) <= 1e-12
 
 
+def test_both_levels_hold_within_steps_too():
+    ts = jnp.array([0.213, 0.2777, 0.301])
+    run = ej.simulate(
+        DRIVEN_PENDULUM,
+        ej.EnergyPreserving(),
+        driven_start(),
+        ARGS,
+        h=0.05,
+        t0=T0,
+        t1=T0 + 0.15,
+        saveat=ej.SaveAt(ts=ts),
+    )
+    at = ARGS["r"] * np.stack([np.sin(ARGS["w"] * ts), 0 * ts], axis=1)
+    # Solver.
+    assert np.max(np.abs(np.linalg.norm(run.ys.q - at, axis=1) - 1)) <= 1e-13
+    assert np.max(np.abs(run.audit.constraint_rate)) <= 1e-12
+
+
 def test_the_energy_balance_includes_the_work_of_the_drive():
     audit = driven_run().audit
     change = audit.work + audit.drive_work - audit.dissipated

@@ -66,6 +66,16 @@ def test_rows_before_a_failure_are_those_of_a_shorter_run(name, scheme, alpha, h
         np.testing.assert_allclose(x[: done + 1], y, rtol=0, atol=1e-9)
 
 
+def test_a_negative_kappa_is_a_failure_too():
+    h = 0.006
+    solution = run("double", "kappa", 0.5, h)
+    assert solution.result == ej.RESULTS.kappa_out_of_range
+    system, _, args = problem("double")
+    out = ej.step(system, ej.KappaDecaying(0.5), solution.end, args, h=h)
+    assert out.result == ej.RESULTS.kappa_out_of_range
+    assert float(out.details) < 0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("h", [0.02, 0.05])
 @pytest.mark.parametrize("alpha", [0.0, 0.5, 1.0])

@@ -161,6 +161,18 @@ def test_a_start_is_made_consistent_in_positions_and_momenta():
     assert float(jnp.max(jnp.abs(found.rate_before))) > 1
 
 
+def test_a_relativistic_start_is_made_consistent():
+    """Velocities are no linear functions of the momenta."""
+    rod = lambda q, args: jnp.stack([q @ q - 1])
+    system = ej.System.from_hamiltonian(lambda q, p, args: jnp.sqrt(1 + p @ p), rod)
+    start = ej.initial_state(system, [0.6, 0.8], [0.7, 0.2])
+    assert float(start.q @ start.v) == pytest.approx(0, abs=1e-14)  # round-off
+    assert float(start.v @ start.v) > 0.01
+    # From here Newton's method diverges.
+    with pytest.raises(ValueError, match="too far from the constraints"):
+        ej.initial_state(system, [0.6, 0.8], [2.0, 1.5])
+
+
 BAD = [
     (
         ej.System.from_lagrangian(lambda q, w, args: w @ w + w[0], lambda q, args: q @ q),

@@ -43,6 +43,20 @@ def test_positions_move_by_the_smallest_change_in_the_inertia():
     assert outside_of_the_rows(gradients, change) > 1e-3
 
 
+def test_the_smallest_change_in_an_inertia_that_couples_the_coordinates():
+    inertia = jnp.array([[2.0, 0.9], [0.9, 1.0]])
+    system = ej.System(
+        inertia, lambda q, args: 0.0 * q[0], problem("pendulum").system.constraint
+    )
+    guess, slow = jnp.array([0.9, 0.5]), jnp.array([0.3, 0.7])
+    start = ej.initial_state(system, guess, slow, dict(l=1.0))
+    assert (
+        outside_of_the_rows(start.q[None], inertia @ (start.q - guess)) <= 1e-12
+    )  # solver
+    assert outside_of_the_rows(start.q[None], inertia @ (start.v - slow)) <= 1e-12
+    assert outside_of_the_rows(start.q[None], start.q - guess) > 1e-2
+
+
 def test_velocities_move_by_the_smallest_change_in_the_inertia():
     system, args = unequal()
     start = ej.initial_state(system, GUESS["q"], GUESS["v"], args)

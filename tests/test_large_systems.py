@@ -37,6 +37,7 @@ FUNCTIONS = {
         lambda x: jnp.zeros(6).at[jnp.array([0, 2, 2])].add(x[6:9] ** 2) + x[:6],
         True,
     ),
+    "add": (lambda x: x.at[jnp.array([0, 2, 2])].add(x[6:9] ** 2), True),
     "set": (lambda x: x.at[2].set(x[0] * x[1]), True),
     "dot": (lambda x: MATRIX @ x[:6], True),
     "dots": (lambda x: (x[:6].reshape(2, 3) @ x[6:].reshape(3, 2)).ravel(), True),

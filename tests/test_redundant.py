@@ -187,6 +187,28 @@ def test_derivatives_of_multipliers_of_least_norm(scheme):
     np.testing.assert_allclose(forward, change, rtol=1e-4)
 
 
+def test_derivatives_of_forces_that_turn_against_each_other():
+    """A point at rest on three rods: where these end decides how they share its weight."""
+    feet = lambda x: jnp.array([[-1.0, 1.0], [1.0, 1.2], [0.2, 1.0]]).at[2, 0].add(x)
+    rows = lambda q, x: jnp.sum((q[None] - feet(x)) ** 2 - feet(x) ** 2, axis=1)
+    system = ej.System(jnp.eye(2), lambda q, x: G * q[1], rows, redundant=True)
+
+    def forces(x):
+        start = ej.State(jnp.zeros(2), jnp.zeros(2))
+        run = ej.simulate(system, ej.EnergyPreserving(), start, x, h=0.01, num_steps=2)
+        return run.multipliers[-1]
+
+    def of_least_norm(x):
+        size = 2 * jnp.linalg.norm(feet(x), axis=1)
+        unit = -2 * feet(x) / size[:, None]
+        return unit @ jnp.linalg.solve(unit.T @ unit, jnp.array([0.0, -G])) / size
+
+    # Round-off, divided by what makes the equations regular; for the derivative, twice.
+    near = lambda x, y, atol: np.testing.assert_allclose(x, y, rtol=0, atol=atol)
+    near(jax.jit(forces)(0.1), of_least_norm(0.1), 1e-6)
+    near(jax.jit(jax.jacfwd(forces))(0.1), jax.jacfwd(of_least_norm)(0.1), 1e-4)
+
+
 def beam_of_parts(angle, **more):
     """On three parallel cranks, `angle` above the horizontal; `length` of the last."""
     up = np.array([np.cos(angle), np.sin(angle)])

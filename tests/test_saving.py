@@ -43,6 +43,13 @@ def test_the_end_is_a_row_where_the_steps_do_not_fill_the_last_one():
     np.testing.assert_allclose(thin.stats.local_error, estimates, rtol=1e-6)
 
 
+def test_rows_of_a_prime_number_of_steps():
+    """The steps of a row are cut into segments of equal length, which 31 has not."""
+    thin, full = (run(ej.SaveAt(every=k), num_steps=62) for k in (31, 1))
+    # Round-off: another program.
+    np.testing.assert_allclose(thin.ys.q, full.ys.q[::31], rtol=0, atol=100 * EPS)
+
+
 def test_a_function_of_the_state_is_saved_in_its_place():
     height = lambda t, state, args: {"y": args["l"] * state.q[1], "t": t, "row": 1}
     told, full = run(ej.SaveAt(every=8, fn=height)), every_step()
@@ -79,7 +86,11 @@ def test_a_number_of_steps_has_rows_at_times_too():
     counted = run(ej.SaveAt(ts=ts), num_steps=STEPS)
     timed = run(ej.SaveAt(ts=ts), t1=STEPS * H)
     np.testing.assert_allclose(counted.ys.q, timed.ys.q, rtol=0, atol=100 * EPS)
-    np.testing.assert_allclose(counted.ys.q[0], every_step().ys.q[1], atol=100 * EPS)
+    full = every_step()
+    np.testing.assert_allclose(counted.ys.q[0], full.ys.q[1], atol=100 * EPS)
+    # The energies of a row are those of the steps that have ended since the row before.
+    sums = np.add.reduceat(np.asarray(full.audit.dissipated)[1:], [0, 1, 19])
+    np.testing.assert_allclose(counted.audit.dissipated, sums, rtol=0, atol=100 * EPS)
 
 
 def test_derivatives_pass_through_a_function_of_the_state():

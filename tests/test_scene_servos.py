@@ -156,6 +156,29 @@ def test_lengths_and_forces_equal_those_computed_by_hand():
         scene.measure(start, "dot")
 
 
+def test_lengths_along_an_axis_in_space():
+    """Of a slider that a joint keeps on an oblique axis, and of a point that is led."""
+    axis, away = np.array([2.0, -1.0, 2.0]) / 3, np.array([1.0, 2.0, 0.5])
+    box = ej.bodies.RigidBody("box", 1.0, [0.3, 0.4, 0.5], 0.7 * axis, velocity=1.5 * axis)
+    led = ej.bodies.PointMass("led", 1.0, away, 3 * away)
+    drive = lambda t, args: args["far"] * (1 + 3 * t)
+    scene = ej.Scene(
+        [
+            box,
+            led,
+            ej.joints.Prismatic("guide", "ground", "box", axis=axis),
+            ej.drives.Displacement("ram", "ground", "led", drive, axis=axis),
+        ],
+        args=dict(far=axis @ away),
+    )
+    start = scene.start()
+    far = float(axis @ away)
+    for name, value, rate in (("guide", 0.7, 1.5), ("ram", far, 3 * far)):
+        seen = scene.measure(start, name)
+        # Round-off.
+        np.testing.assert_allclose([seen.value, seen.rate], [value, rate], rtol=1e-13)
+
+
 def test_a_law_of_another_signature_is_refused_by_its_name():
     for part in (ej.forces.TorsionActuator, ej.forces.Actuator):
         with pytest.raises(

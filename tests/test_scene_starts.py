@@ -68,6 +68,48 @@ def test_velocities_that_joints_do_not_admit_are_refused():
     np.testing.assert_allclose(rounded, [0.0, 1.0075, 2.015], rtol=0, atol=1e-14)
 
 
+# Quaternions, of any length; half a turn has no scalar part.
+TURNS = [
+    [0.3, -0.2, 0.5, 0.4],
+    [0.0, -4.0, 1.2, 0.5],
+    [0.0, 0.3, 2.0, 0.4],
+    [1e-9, 0.3, -0.5, 2.0],
+]
+
+
+@pytest.mark.parametrize("turn", TURNS)
+@pytest.mark.parametrize("body", [ej.bodies.RigidBody, ej.bodies.QuaternionBody])
+def test_a_body_in_space_starts_as_it_is_told(body, turn):
+    """Its axes, the velocities of its points, and its energy, by formulas of mechanics."""
+    a, x, y, z = np.array(turn) / np.linalg.norm(turn)
+    # Rodrigues' formula, with the sine and cosine of half of the angle.
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    rotation = np.eye(3) + 2 * a * skew + 2 * skew @ skew
+    inertia = np.array([[0.6, 0.1, -0.05], [0.1, 0.5, 0.08], [-0.05, 0.08, 0.7]])
+    place, velocity, spin = np.array([[1.0, 2.0, -1.0], [0.4, -0.3, 0.2], [1.0, 3.0, -2.0]])
+    box = body(
+        "box",
+        2.0,
+        inertia,
+        place,
+        rotation,
+        velocity=velocity,
+        angular_velocity=spin,
+    )
+    scene = ej.Scene([box])
+    system, start, args = scene.build()
+    point = np.array([0.2, -0.1, 0.3])
+    arm = rotation @ point
+    # Round-off.
+    near = lambda x, y: np.testing.assert_allclose(x, y, rtol=0, atol=1e-14)
+    near(scene.direction(start, "box", point), arm)
+    near(scene.position(start, "box", point), place + arm)
+    near(scene.velocity(start, "box", point), velocity + np.cross(spin, arm))
+    in_space = rotation @ inertia @ rotation.T
+    energy = 0.5 * (2.0 * velocity @ velocity + spin @ in_space @ spin)
+    np.testing.assert_allclose(system.energy(start, args), energy, rtol=1e-14)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "body",

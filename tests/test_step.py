@@ -10,7 +10,7 @@ import pytest
 
 import enerjax as ej
 
-from .helpers import long, problem, SCHEMES, solve
+from .helpers import EPS, long, problem, SCHEMES, solve
 
 
 # Round-off of a few hundred steps, compiled in another way.
@@ -153,6 +153,15 @@ def test_a_step_of_minus_h_undoes_a_step_of_h(scheme):
     again = step(step(first, 0.02), -0.02)
     np.testing.assert_allclose(again.q, first.q, **SAME)
     np.testing.assert_allclose(again.v, first.v, **SAME)
+
+
+def test_rounding_errors_far_from_the_origin_do_not_add_up():
+    """Each of a thousand steps of 1e-4 is rounded, by up to 6e-11, and always alike."""
+    free = ej.System(jnp.eye(1), lambda q, args: 0.0 * q[0])
+    start = ej.State([1e6], [0.1])
+    run = ej.simulate(free, ej.EnergyPreserving(), start, h=1e-3, num_steps=1000)
+    # Round-off, of two numbers.
+    np.testing.assert_allclose(run.end.q - 1e6, 0.1, rtol=0, atol=2 * EPS * 1e6)
 
 
 def test_a_composition_is_its_stages_one_after_the_other():

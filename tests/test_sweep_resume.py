@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -62,6 +63,12 @@ def test_another_sweep_is_not_resumed(tmp_path):
     ej.sweep(loop(3), over, path=tmp_path / "loop")
     with pytest.raises(ValueError, match="another sweep .different: program."):
         ej.sweep(loop(4), over, path=tmp_path / "loop")
+    # So is one with other numbers in a table.
+    table = lambda x: lambda a, b: jnp.interp(a + b, jnp.arange(3.0), np.array(x))
+    ej.sweep(table([0.0, 1.0, 3.0]), over, path=tmp_path / "table")
+    ej.sweep(table([0.0, 1.0, 3.0]), over, path=tmp_path / "table")
+    with pytest.raises(ValueError, match="another sweep .different: program."):
+        ej.sweep(table([0.0, 1.0, 4.0]), over, path=tmp_path / "table")
 
 
 def stepped(scheme, newton):

@@ -143,7 +143,7 @@ def project_velocity(
     model: AbstractModel, state: State, known: tuple[int, ...]
 ) -> tuple[Velocities, Flag]:
     """The nearest velocities (or momenta) that the joints admit, and whether these keep
-    the known entries."""
+    the known entries; of momenta, whether Newton's method found them."""
     q, v, t = state.q, state.v, state.t
     if model.joint(q, t).size == 0:
         return v, jnp.array(True)
@@ -179,7 +179,9 @@ def project_velocity(
     # the corrections are iterations of Newton's method, which converge quadratically.
     corrections = 8 if isinstance(model.system, HamiltonianSystem) else 1
     regularisation = model.regularisation(unit.size, v.dtype)
-    again = lambda v, _: (correct(v, rates, unit, regularisation), None)
-    end = jax.lax.scan(again, end, None, length=corrections)[0]
-    changed = largest(((end - v) / root)[jnp.asarray(known, int)])
-    return end, changed <= eps**0.5 * largest(v / root)
+    again = lambda v, _: (correct(v, rates, unit, regularisation), v)
+    end, before = jax.lax.scan(again, end, None, length=corrections)
+    changed = ((end - v) / root)[jnp.asarray(known, int)]
+    if corrections > 1:
+        changed = (end - before[-1]) / root
+    return end, largest(changed) <= eps**0.5 * largest(v / root)
