@@ -39,31 +39,34 @@ def part(path):
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
+def inside(path):
+    return path.relative_to(PACKAGE).with_suffix("").parts
+
+
 def imports(path):
-    """Modules of `enerjax` and others that a file imports, and the names it takes."""
-    inside = path.relative_to(PACKAGE).with_suffix("").parts
-    for node in ast.walk(ast.parse(path.read_text())):
+    return imports_of(path.read_text(), inside(path))
+
+
+def imports_of(source, place):
+    """Modules of `enerjax` and others that a source at some place imports, and the names
+    it takes of them: none where it imports the module itself."""
+    for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
-            for alias in node.names:
-                yield alias.name, ()
+            yield from ((alias.name, ()) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             names = tuple(alias.name for alias in node.names)
-            module = node.module or ""
-            if node.level == 0:
-                yield module, names
-                continue
-            base = ("enerjax", *inside[: len(inside) - node.level])
-            if module:
-                yield ".".join((*base, module)), names
+            above = ("enerjax", *place[: len(place) - node.level]) if node.level else ()
+            module = ".".join((*above, *filter(None, [node.module])))
+            if node.module in (None, "enerjax"):
+                yield from ((f"{module}.{name}", ()) for name in names)
             else:
-                yield from ((".".join((*base, name)), ()) for name in names)
+                yield module, names
 
 
 def parts_imported(path):
-    for module, names in imports(path):
-        if module == "enerjax":
-            yield from names
-        elif module.startswith("enerjax."):
+    for module, _ in imports(path):
+        assert module != "enerjax", "its rooms would not be seen"
+        if module.startswith("enerjax."):
             yield module.split(".")[1]
 
 
@@ -104,22 +107,59 @@ def test_programs_know_nothing_else():
     assert rooms_imported("_programs") == {"_types"}
 
 
+def of_solvers(source, place):
+    """What a source takes from the solvers, from whichever module; `*` is all of them."""
+    for module, names in imports_of(source, place):
+        if module.startswith("enerjax._solvers"):
+            yield from names or "*"
+        elif module.startswith("enerjax."):
+            owner = importlib.import_module(module) if names else None
+            for name in names:
+                home = getattr(getattr(owner, name), "__module__", None) or ""
+                if home.startswith("enerjax._solvers"):
+                    yield name
+
+
+def of_libraries(source):
+    """The linear algebra and the solvers of other libraries that a source names."""
+    tree = ast.parse(source)
+    for module, names in imports_of(source, ()):
+        known = {"linalg", "optimistix", "lineax", "scipy"}
+        yield from known & {*module.split("."), *names}
+    attributes = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    yield from {"linalg", "scipy"} & attributes
+
+
 def test_schemes_know_no_solver():
     """A scheme states equations. What it takes from linear algebra are kinds of matrices,
     and the functions of a stiffness matrix by which `EnergyConsistent` is defined."""
-    for module in all_imports("schemes"):
-        assert module.split(".")[0] not in ("optimistix", "lineax")
-    taken = {
-        (path.name, name)
-        for path in files_of("schemes")
-        for module, names in imports(path)
-        if module.startswith("enerjax._solvers")
-        for name in names
-    }
+    schemes = {path.name: (path.read_text(), inside(path)) for path in files_of("schemes")}
+    assert not [name for name, (source, _) in schemes.items() if [*of_libraries(source)]]
+    taken = {(name, x) for name, source in schemes.items() for x in of_solvers(*source)}
     of_stiffness = {"as_dense", "Assembled", "cholesky", "eigh", "inverse", "product"}
     assert taken == {("energy_consistent.py", "Assembled")} | {
         ("_dissipative_stiffness.py", name) for name in of_stiffness | {"Symmetric"}
     }
+
+
+@pytest.mark.parametrize(
+    ("source", "name"),
+    [
+        ("from .._solvers import inverse", "inverse"),
+        ("from .._solvers.linear.symmetric import eigh as e", "eigh"),
+        ("def late():\n    from .._solvers import cholesky", "cholesky"),
+        ("from .._operators.separable import product", "product"),
+        ("from .. import _solvers", "*"),
+        ("from enerjax import _solvers", "*"),
+        ("import enerjax._solvers as s", "*"),
+        ("import optimistix as optx", "optimistix"),
+        ("from jax.scipy.linalg import cho_solve", "linalg"),
+        ("from jax.numpy import linalg", "linalg"),
+        ("x = jnp.linalg.solve(a, b)", "linalg"),
+    ],
+)
+def test_a_scheme_that_knows_a_solver_is_seen(source, name):
+    assert name in {*of_solvers(source, ("schemes", "rattle")), *of_libraries(source)}
 
 
 def test_the_run_knows_no_scheme_by_name():
@@ -216,7 +256,7 @@ def public():
         for name, value in vars(owner).items():
             if not name.startswith("_") and not inspect.ismodule(value):
                 yield f"{owner.__name__}.{name}", value
-    for owner in (ej.bodies, ej.joints, ej.forces):
+    for owner in (ej.bodies, ej.joints, ej.forces, ej.drives):
         for name, value in vars(owner).items():
             here = getattr(value, "__module__", None) == owner.__name__
             if not name.startswith("_") and here:

@@ -107,6 +107,29 @@ def test_one_coordinate_gets_the_third_order_from_any_derivative():
     np.testing.assert_allclose(slopes(error)[-2:], 3, rtol=0, atol=0.1)
 
 
+# The locking scheme is left out: decaying index 3. Bounds are C h^p at h = 0.01.
+SAME_MOTION = [
+    ("preserving", 0.0, 6e-3),
+    ("preserving index3", 0.0, 6e-3),
+    ("decaying", 0.0, 6e-3),
+    ("decaying", 1.0, 6e-3),
+    ("kappa", 0.0, 1.2e-2),
+    ("consistent", 0.0, 1e-7),
+    ("consistent", 1.0, 5e-5),
+    ("composed 4", 0.0, 1e-5),
+]
+
+
+@pytest.mark.parametrize(("scheme", "alpha", "bound"), SAME_MOTION)
+def test_the_constrained_pendulum_swings_as_the_one_in_its_angle(scheme, alpha, bound):
+    for steps in (50, 100, 150, 200):
+        point = march("pendulum", scheme, alpha, h=0.01, steps=steps).q
+        angle = march("angle", scheme, alpha, h=0.01, steps=steps).q[0]
+        # Truncation, of both; and of the scheme in the angle against the reference.
+        assert abs(np.arctan2(point[0], point[1]) - angle) <= bound
+        assert abs(angle - pendulum_reference(0.01 * steps)[0]) <= bound
+
+
 @pytest.mark.parametrize(
     ("scheme", "alpha", "steps", "bound"),
     [

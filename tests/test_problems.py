@@ -6,16 +6,17 @@ import pytest
 
 import enerjax as ej
 
-from .helpers import EPS, failed, long, march, problem, PROBLEMS, slopes, solve, TURNOVER
-from .references import CAR_AXIS, FOUR_PARTICLES, FREE_BODY, HEAVY_TOP, pendulum_reference
+from .helpers import failed, long, march, problem, PROBLEMS, slopes, solve, TURNOVER
+from .references import CAR_AXIS, FOUR_PARTICLES, FREE_BODY, HEAVY_TOP
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_starts_are_consistent(name):
+    """To round-off: none of them is moved."""
     system, start, args = problem(name)
-    consistent = ej.consistent_start(system, start.q, start.v, args)
-    np.testing.assert_allclose(consistent.constraint_before, 0, atol=20 * EPS)
-    np.testing.assert_allclose(consistent.rate_before, 0, atol=1e3 * EPS)
+    again = ej.initial_state(system, start.q, start.v, args)
+    np.testing.assert_array_equal(again.q, start.q)
+    np.testing.assert_array_equal(again.v, start.v)
 
 
 @pytest.mark.parametrize("name", ["top", "body", "particles"])
@@ -26,29 +27,6 @@ def test_energies_of_the_starts_are_the_published_ones(name):
         {"top": 5435.696790865547, "body": 2500.0, "particles": 1.1764705882352942}[name],
         rel=1e-10,
     )
-
-
-# The locking scheme is left out: decaying index 3. Bounds are C h^p at h = 0.01.
-SAME_MOTION = [
-    ("preserving", 0.0, 6e-3),
-    ("preserving index3", 0.0, 6e-3),
-    ("decaying", 0.0, 6e-3),
-    ("decaying", 1.0, 6e-3),
-    ("kappa", 0.0, 1.2e-2),
-    ("consistent", 0.0, 1e-7),
-    ("consistent", 1.0, 5e-5),
-    ("composed 4", 0.0, 1e-5),
-]
-
-
-@pytest.mark.parametrize(("scheme", "alpha", "bound"), SAME_MOTION)
-def test_the_constrained_pendulum_swings_as_the_one_in_its_angle(scheme, alpha, bound):
-    for steps in (50, 100, 150, 200):
-        point = march("pendulum", scheme, alpha, h=0.01, steps=steps).q
-        angle = march("angle", scheme, alpha, h=0.01, steps=steps).q[0]
-        # Truncation, of both; and of the scheme in the angle against the reference.
-        assert abs(np.arctan2(point[0], point[1]) - angle) <= bound
-        assert abs(angle - pendulum_reference(0.01 * steps)[0]) <= bound
 
 
 def top(h, scheme="preserving"):
