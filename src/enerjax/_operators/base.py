@@ -34,6 +34,7 @@ from .._discrete import AbstractCorrected, AbstractDerivative
 from .._solvers import Assembled, RowPattern, Symmetric
 from .._system import AbstractSystem, State
 from .._types import Args, Coordinates, JointMultipliers, Multipliers, Scalar, Velocities
+from .constraint_matrix import ConstraintMatrix
 from .interval import Gradient, Increment, Scales, Time, time_rate
 
 
@@ -194,6 +195,10 @@ class AbstractModel(eqx.Module):
         work. Time counts as a coordinate whose momentum nothing depends on. With constant
         inertia the second part is empty; `stiffness_product` gives it.
         """
+
+    @abc.abstractmethod
+    def constraint_matrix(self, q: Coordinates, t: Time) -> ConstraintMatrix | None:
+        """`B M^-1 B^T` at a position; `None` where no chord iteration is made with it."""
 
     @abc.abstractmethod
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:

@@ -32,6 +32,7 @@ from .._solvers import (
 from .._system import AbstractKinematics, IdentityKinematics, State, System
 from .._types import Args, Coordinates, JointMultipliers, Multipliers, Scalar, Velocities
 from .base import AbstractModel, Reaction
+from .constraint_matrix import constraint_matrix, ConstraintMatrix
 from .elements import element_energies, gradient_and_work_by_rows, is_weight, Summands
 from .interval import Gradient, gradient_and_work, Increment, Scales, Time, time_rate
 
@@ -259,6 +260,14 @@ class SeparableModel(AbstractModel):
         force, power = self.stiffness_product(middle, multipliers, (dv, no_time))
         power = None if power is None else h * power
         return Gradient(h * force, dv[:0], power)
+
+    def constraint_matrix(self, q: Coordinates, t: Time) -> ConstraintMatrix | None:
+        # Constraints that repeat each other make the matrix singular.
+        is_flat = self.has_canonical_rates and self.system.coordinate_constraint is None
+        if not is_flat or self.system.redundant:
+            return None
+        joint = lambda q: self.joint(q, t)
+        return constraint_matrix(joint, q, self.inverse_inertia)
 
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
         """The constraints enter with their second derivatives in time.

@@ -16,6 +16,7 @@ from .._operators import AbstractModel, Increment, roughness, scales_like, short
 from .._results import first_failure, from_root_finder, RESULTS
 from .._solvers import (
     AbstractFactors,
+    Chord,
     find_root,
     kept_factors,
     max_norm,
@@ -26,9 +27,9 @@ from .._system import State
 from .._types import Count, Flag, Multipliers, Scalar, Velocities
 from ..schemes import (
     AbstractOneSolveScheme,
+    AbstractSchemeWithChord,
     AbstractSchemeWithMemory,
     StepEnd,
-    StepProblem,
 )
 
 
@@ -128,13 +129,6 @@ def solve(
         z = jax.tree.map(jnp.multiply, x, unknown_scale)
         return jax.tree.map(jnp.divide, scheme.residual(z, problem), row_scale)
 
-    def scaled_with_weak_couplings_held(x, inputs):
-        scheme, problem, *scales = inputs
-        return scaled(x, (scheme, problem.with_weak_couplings_held(), *scales))
-
-    has_weak_couplings = (
-        isinstance(problem, StepProblem) and problem.weak_couplings == "exact"
-    )
     inputs = (scheme, problem, unknown_scale, row_scale)
 
     guess = jax.tree.map(
@@ -154,7 +148,7 @@ def solve(
         skip=skip,
         regularisation=_regularisation(model, unknown_scale, row_scale),
         least=least,
-        jacobian_of=scaled_with_weak_couplings_held if has_weak_couplings else None,
+        chord=_chord(scheme, guess, inputs),
     )
     z = jax.tree.map(jnp.multiply, root.value, unknown_scale)
     end = scheme.finish(z, problem)
@@ -170,6 +164,29 @@ def solve(
         roughness=roughness(model.scales.coordinate, added, memory.added, unknown_scale),
         memory=_memory_after(memory, added, unknown_scale, root.factors, end.carried),
     )
+
+
+def _chord(
+    scheme: AbstractOneSolveScheme, guess: PyTree[Array], inputs: Any
+) -> Chord | None:
+    """Corrections with inertia and constraints alone; `None` where there are none."""
+    if not isinstance(scheme, AbstractSchemeWithChord):
+        return None
+
+    def prepare(x, inputs):
+        scheme, problem, unknown_scale, _ = inputs
+        z = jax.tree.map(jnp.multiply, x, unknown_scale)
+        return scheme.constraint_matrix(z, problem)
+
+    def correct(value, inputs, matrix):
+        scheme, problem, unknown_scale, row_scale = inputs
+        rows = jax.tree.map(jnp.multiply, value, row_scale)
+        correction = scheme.chord(rows, problem, matrix)
+        return jax.tree.map(jnp.divide, correction, unknown_scale)
+
+    if eqx.filter_eval_shape(prepare, guess, inputs) is None:
+        return None
+    return Chord(prepare, correct)
 
 
 def _predicted(memory: Memory) -> PyTree[Any]:

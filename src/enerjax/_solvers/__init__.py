@@ -29,9 +29,10 @@ from .linear.jacobian import (
     RowPattern as RowPattern,
 )
 from .linear.norms import largest as largest
+from .linear.schur import Schur as Schur, schur as schur, schur_tables as schur_tables
 from .linear.symmetric import cholesky as cholesky, eigh as eigh
 from .linear.user_solver import KLU as KLU
 from .newton import Newton as Newton
 from .newton_iterations import max_norm as max_norm
 from .root import find_root as find_root, ROOT as ROOT
-from .search import RootFinder as RootFinder
+from .search import Chord as Chord, RootFinder as RootFinder

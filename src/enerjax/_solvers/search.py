@@ -1,7 +1,7 @@
 """The search for a root: by Newton's method, or by a root finder of optimistix."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,15 +12,27 @@ from jaxtyping import Array, Float, PyTree
 from typing_extensions import TypeAliasType
 
 from .._types import Count, Flag, Scalar
+from .chord_iterations import chord_iterations
 from .linear.dense import AbstractFactors, Inverse
-from .linear.jacobian import Linearisable, linearisable, narrowed
+from .linear.jacobian import Linearisable, linearisable
 from .newton import Newton, Start
-from .newton_iterations import max_norm, newton_iterations, PATIENCE
+from .newton_iterations import max_norm, newton_iterations
 
 
 RootFinder = TypeAliasType(
     "RootFinder", Newton | optx.AbstractRootFinder | optx.AbstractLeastSquaresSolver
 )
+
+
+class Chord(NamedTuple):
+    """Corrections with a matrix that is close to the Jacobian and is known in closed form.
+
+    - `prepare(y, args)`: what all corrections of a search share, found near the guess `y`.
+    - `correct(value, args, prepared)`: the correction of a residual.
+    """
+
+    prepare: Callable[[PyTree[Array], Any], PyTree]
+    correct: Callable[[PyTree[Array], Any, PyTree], PyTree[Array]]
 
 
 class Root(eqx.Module):
@@ -56,7 +68,7 @@ def flat_of(regularisation: PyTree[Array] | None) -> Array | None:
 
 def search(
     fn: Callable[[PyTree[Array], Any], PyTree[Array]],
-    jacobian_of: Callable[[PyTree[Array], Any], PyTree[Array]] | None,
+    chord: Chord | None,
     root_finder: RootFinder,
     args: PyTree,
     start: Start,
@@ -85,23 +97,39 @@ def search(
         )
     flat, _, flat_fn = flattened(fn, start.guess)
     given, regularisation = root_finder.linear_solver, flat_of(start.regularisation)
-    exact, narrow = linearisable(flat_fn, flat, args, given, regularisation), None
-    if jacobian_of is not None and given is None:
-        _, _, flat_jacobian_of = flattened(jacobian_of, start.guess)
-        narrow = narrowed(exact, flat_jacobian_of, flat, args)
-    if narrow is None:
+    exact = linearisable(flat_fn, flat, args, given, regularisation)
+    if chord is None or given is not None:
         return _iterated(exact, root_finder, start, max_iterations)
-    alone = eqx.tree_at(lambda start: start.others, start, ())
-    first = _iterated(narrow, root_finder, alone, PATIENCE)
+    first = _by_chord(exact, chord, root_finder, args, start)
 
     def again() -> Root:
         # (The lanes of a batch all come here.)
         left = eqx.tree_at(lambda start: start.skip, start, start.skip | first.found)
         last = _iterated(exact, root_finder, left, max_iterations)
-        total = first.iterations + last.iterations
-        return eqx.tree_at(lambda root: root.iterations, last, total)
+        last = eqx.tree_at(
+            lambda root: root.iterations, last, last.iterations + first.iterations
+        )
+        return jax.tree.map(lambda x, y: jnp.where(first.found, x, y), first, last)
 
     return jax.lax.cond(first.found, lambda: first, again)
+
+
+def _by_chord(
+    residual: Linearisable, chord: Chord, newton: Newton, args: PyTree, start: Start
+) -> Root:
+    guess, unravel = ravel_pytree(start.guess)
+    prepared = chord.prepare(start.guess, args)
+    solve = lambda right: ravel_pytree(chord.correct(unravel(right), args, prepared))[0]
+    last = chord_iterations(residual.value, solve, newton, start, guess)
+    return Root(
+        value=unravel(last.x),
+        factors=start.factors,
+        iterations=last.corrections,
+        residual=last.defect,
+        found=last.done,
+        broken=jnp.array(False),
+        finite=jnp.isfinite(last.defect),
+    )
 
 
 def _iterated(

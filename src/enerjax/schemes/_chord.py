@@ -15,8 +15,8 @@ from ._discontinuous import JumpAndEnd
 def step_chord(rows: Increment, constraints: ConstraintMatrix) -> Increment:
     """For an interval with `v1 = 2 (rate - M^-1 B^T eta) - v0`.
 
-        2 M rate + B^T (impulse - 2 eta) = r_m
-        B rate = r_phi,   2 B rate - 2 G eta = r_psi
+    2 M rate + B^T (impulse - 2 eta) = r_m
+    B rate = r_phi,   2 B rate - 2 G eta = r_psi
     """
     free = 0.5 * (constraints.inverse_inertia @ rows.rate)
     impulse = constraints.product(free) - rows.impulse

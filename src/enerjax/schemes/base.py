@@ -206,6 +206,11 @@ class StepProblem(eqx.Module):
             return jnp.zeros((0,), state.q.dtype)
         return self.model.joint_rate(state.q, state.v, state.t)
 
+    def constraint_matrix(self, end: Increment) -> ConstraintMatrix | None:
+        """`B M^-1 B^T` in the middle of the step to `end`; `None` where it is of no use."""
+        middle = self.start.q + 0.5 * self.h * end.rate
+        return self.model.constraint_matrix(middle, self.middle_time)
+
     def rows(self, z: Increment, state: State, gradient: Gradient) -> Increment:
         """The rows of one node: the structure residual, and the constraints there."""
         h = self.h
@@ -359,6 +364,10 @@ class AbstractSchemeWithChord(AbstractOneSolveScheme[Z, P], Generic[Z, P]):
     those of `B M^-1 B^T`: a search begins so, with constant inertia and `v = qdot`, and
     goes on with the exact Jacobian where that fails.
     """
+
+    @abc.abstractmethod
+    def constraint_matrix(self, z: Z, problem: P) -> ConstraintMatrix | None:
+        """The matrix of the constraints in the middle of the step that `z` describes."""
 
     @abc.abstractmethod
     def chord(self, rows: Z, problem: P, constraints: ConstraintMatrix) -> Z:

@@ -5,15 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._discrete import AbstractDerivative, MeanValue
-from .._operators import AbstractModel, Gradient, Increment, Reaction
+from .._operators import AbstractModel, ConstraintMatrix, Gradient, Increment, Reaction
 from .._programs import is_known
 from .._solvers import Assembled
 from .._system import State
 from .._types import Multipliers, Real, Scalar, Velocities
 from ._arguments import alpha_from_spectral_radius, as_alpha, check_derivative
+from ._chord import step_chord
 from ._discontinuous import JumpAndEnd
 from ._dissipative_stiffness import dissipative_stiffness, DissipativeStiffness
-from ._chord import step_chord
 from .base import AbstractSchemeWithChord, Formulation, StepEnd, StepProblem
 
 
@@ -139,12 +139,15 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
         jump_rows = eqx.tree_at(lambda rows: rows.rate, z.jump, row)
         return JumpAndEnd(jump_rows, self._rows(z.end, problem, end, jump))
 
+    def constraint_matrix(self, z: _Unknowns, problem: _Problem) -> ConstraintMatrix | None:
+        return problem.step.constraint_matrix(_end_of(z))
+
     def chord(
         self, rows: _Unknowns, problem: _Problem, constraints: ConstraintMatrix
     ) -> _Unknowns:
         if not isinstance(rows, JumpAndEnd):
             return step_chord(rows, constraints)
-        # The jump in the velocities is an unknown of its own, which lowers those at the end.
+        # The jump of the velocities is an unknown too, which lowers those at the end.
         jump = constraints.inverse_inertia @ rows.jump.rate
         end = eqx.tree_at(
             lambda end: (end.rate, end.velocity_impulse),

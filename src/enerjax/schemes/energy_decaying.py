@@ -1,7 +1,7 @@
 import equinox as eqx
 
 from .._discrete import AbstractDerivative, ChainRule
-from .._operators import AbstractModel, Reaction
+from .._operators import AbstractModel, ConstraintMatrix, Reaction
 from .._system import State
 from .._types import Multipliers, Real, Scalar, Velocities
 from ._arguments import (
@@ -10,6 +10,7 @@ from ._arguments import (
     check_derivative,
     check_formulation,
 )
+from ._chord import jump_chord
 from ._discontinuous import (
     jump_energy,
     jump_gradient,
@@ -19,7 +20,6 @@ from ._discontinuous import (
     predict_jump_and_end,
     split_velocities,
 )
-from ._chord import jump_chord
 from .base import AbstractSchemeWithChord, Formulation, StepEnd, StepProblem
 
 
@@ -110,6 +110,11 @@ class EnergyDecaying(AbstractSchemeWithChord[JumpAndEnd, StepProblem]):
             jump=problem.rows(z.jump, jump, to_jump),  # eq. (47b)
             end=problem.rows(z.end, end, after),  # eq. (47a)
         )
+
+    def constraint_matrix(
+        self, z: JumpAndEnd, problem: StepProblem
+    ) -> ConstraintMatrix | None:
+        return problem.constraint_matrix(z.end)
 
     def chord(
         self, rows: JumpAndEnd, problem: StepProblem, constraints: ConstraintMatrix

@@ -2,7 +2,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._discrete import AbstractDerivative, ChainRule
-from .._operators import AbstractModel, Increment, Reaction
+from .._operators import AbstractModel, ConstraintMatrix, Increment, Reaction
 from .._system import State
 from .._types import Multipliers, Scalar, Velocities
 from ._arguments import check_derivative, check_formulation
@@ -62,6 +62,11 @@ class EnergyPreserving(AbstractSchemeWithChord[Increment, StepProblem]):
         gradient = problem.discrete_gradient(problem.start, end, z)
         load = problem.step_load(end, z)
         return problem.rows(z, end, gradient.less(load))  # eq. (14a, c)
+
+    def constraint_matrix(
+        self, z: Increment, problem: StepProblem
+    ) -> ConstraintMatrix | None:
+        return problem.constraint_matrix(z)
 
     def chord(
         self, rows: Increment, problem: StepProblem, constraints: ConstraintMatrix

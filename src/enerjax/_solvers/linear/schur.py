@@ -19,7 +19,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from ..._programs import jacobian_pattern, shape_of
-from .banded import block_sizes, column_colours, coloured_products
+from .banded import block_sizes, coloured_products, column_colours
 from .blocks import BlockDiagonal, Symmetric
 from .dense import inverse
 
@@ -171,9 +171,7 @@ class Schur(eqx.Module):
         along = times(self.inverses[:, None], along)
         if tables.num_blocks > 1:
             last = along[-1]
-            _, rest = jax.lax.scan(
-                backward, last, (self.factors, along[:-1]), reverse=True
-            )
+            _, rest = jax.lax.scan(backward, last, (self.factors, along[:-1]), reverse=True)
             along = jnp.concatenate([rest, last[None]])
         return jnp.moveaxis(along, 0, 1).reshape(count, -1)[:, tables.back]
 
