@@ -60,6 +60,11 @@ class AbstractModel(eqx.Module):
 
     @property
     @abc.abstractmethod
+    def has_constraint_matrix(self) -> bool:
+        """Whether a chord iteration with `B M^-1 B^T` can solve the step equations."""
+
+    @property
+    @abc.abstractmethod
     def has_canonical_rates(self) -> bool:
         """Whether `L = I`: velocities are the rates of the coordinates, or `v` is `p`."""
 
@@ -197,8 +202,8 @@ class AbstractModel(eqx.Module):
         """
 
     @abc.abstractmethod
-    def constraint_matrix(self, q: Coordinates, t: Time) -> ConstraintMatrix | None:
-        """`B M^-1 B^T` at a position; `None` where no chord iteration is made with it."""
+    def constraint_matrix(self, q: Coordinates, t: Time) -> ConstraintMatrix:
+        """`B M^-1 B^T` at a position, where `has_constraint_matrix`."""
 
     @abc.abstractmethod
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:

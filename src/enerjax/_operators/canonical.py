@@ -185,8 +185,12 @@ class CanonicalModel(AbstractModel):
         _, (force, rate, power) = jax.jvp(gradient, at, (rate / h, -force / h, no_time))
         return Gradient(force, rate / h, power)
 
-    def constraint_matrix(self, q: Coordinates, t: Time) -> ConstraintMatrix | None:
-        return None
+    @property
+    def has_constraint_matrix(self) -> bool:
+        return False
+
+    def constraint_matrix(self, q: Coordinates, t: Time) -> ConstraintMatrix:
+        raise NotImplementedError
 
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
         q, p, t = state.q, state.v, state.t

@@ -1,12 +1,10 @@
 """The matrix of the multipliers, `G = B M^-1 B^T`, of the constraints of a step."""
 
-from collections.abc import Callable
-
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from .._solvers import Schur, schur, schur_tables, Symmetric
-from .._types import Coordinates, Multipliers, Velocities
+from .._solvers import Schur, Symmetric
+from .._types import Multipliers, Velocities
 
 
 class ConstraintMatrix(eqx.Module):
@@ -30,15 +28,3 @@ class ConstraintMatrix(eqx.Module):
     def solve(self, right: Float[Array, "k nc"]) -> Float[Array, "k nc"]:
         """`G^-1` times some vectors."""
         return self.schur.solve(right)
-
-
-def constraint_matrix(
-    constraint: Callable[[Coordinates], Multipliers],
-    q: Coordinates,
-    inverse_inertia: Symmetric,
-) -> ConstraintMatrix | None:
-    """The matrix at `q`; `None` without constraints, or where it is not narrow."""
-    tables = schur_tables(constraint, q, inverse_inertia)
-    if tables is None:
-        return None
-    return ConstraintMatrix(inverse_inertia, schur(tables, constraint, q, inverse_inertia))

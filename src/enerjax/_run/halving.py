@@ -14,11 +14,11 @@ import jax.numpy as jnp
 from .._operators import AbstractModel
 from .._programs import in_any_lane
 from .._results import RESULTS
-from .._solvers import RootFinder
+from .._solvers import RootFinder, SMALL
 from .._system import State
 from .._types import Count, Flag, Scalar
 from ..schemes import AbstractOneSolveScheme, StepEnd
-from .stage import first_memory, Memory, solve, Solved
+from .stage import first_memory, Memory, num_unknowns, solve, Solved
 
 
 # Of large systems, whose single steps cost far more than what a second program does.
@@ -41,7 +41,7 @@ def solve_or_divide(
     """
     whole = solve(scheme, model, start, h, memory, root_finder, skip)
     if max_halvings is None:
-        is_large = memory.factors is None
+        is_large = num_unknowns(memory) > SMALL
         max_halvings = _HALVINGS_OF_LARGE_SYSTEMS if is_large else 0
     none = jnp.array(0)
     if max_halvings == 0:

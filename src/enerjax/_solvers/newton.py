@@ -67,6 +67,7 @@ class Start(eqx.Module):
       without.
     - `factors`: of the Jacobian of the solve before, where it is kept.
     - `skip`: return the guess without an iteration.
+    - `by_chord`: whether to try a chord iteration first, where there is one.
     - `regularisation`: for each unknown, what is added to the diagonal of a Jacobian that
       may be singular; see `find_root`.
     - `least`: where all unknowns are smaller, it is by round-off.
@@ -76,5 +77,6 @@ class Start(eqx.Module):
     others: tuple[PyTree[Array], ...]
     factors: AbstractFactors | None
     skip: Flag
+    by_chord: Flag
     regularisation: PyTree[Array] | None
     least: Scalar

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, PyTree
 from .._programs import in_one_function, is_known
 from .._types import Flag, Scalar
 from .linear.dense import AbstractFactors
-from .linear.jacobian import kept_factors, Linearisable, linearisable
+from .linear.jacobian import Linearisable, linearisable
 from .newton import Newton, Start
 from .search import Chord, flat_of, flattened, Root, RootFinder, search
 
@@ -101,6 +101,7 @@ def find_root(
     regularisation: PyTree[Array] | None = None,
     least: Scalar | float = 1.0,
     chord: Chord | None = None,
+    by_chord: Flag | bool = True,
 ) -> Root:
     """The root of `fn(y, args)`. Never raises.
 
@@ -116,16 +117,17 @@ def find_root(
     derivatives. If all unknowns turn out smaller than one, they are resolved relative to
     their own size, down to `least`.
 
-    With a `chord`, `Newton` searches with its corrections first, and with the exact
-    Jacobian only where that search has failed. The root and its derivatives are those of
+    With a `chord`, and if `by_chord`, `Newton` searches with its corrections first, and
+    with the exact Jacobian only where that search has failed. The root and its derivatives are those of
     `fn` in any case.
     """
     flat, _ = ravel_pytree(guess)
     start = Start(
         guess=guess,
         others=tuple(others),
-        factors=kept_factors(flat.size, flat.dtype) if factors is None else factors,
+        factors=factors,
         skip=jnp.asarray(skip),
+        by_chord=jnp.asarray(by_chord),
         regularisation=regularisation,
         least=jnp.asarray(least, flat.dtype),
     )

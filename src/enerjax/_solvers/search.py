@@ -45,6 +45,7 @@ class Root(eqx.Module):
     - `found`: whether they converged.
     - `broken`: whether they became singular or non-finite.
     - `finite`: whether the residual is.
+    - `by_chord`: whether a chord iteration has found it.
     """
 
     value: PyTree[Array]
@@ -54,6 +55,7 @@ class Root(eqx.Module):
     found: Flag
     broken: Flag
     finite: Flag
+    by_chord: Flag
 
 
 def flattened(fn: Callable, value: PyTree[Array]) -> tuple[Array, Callable, Callable]:
@@ -94,6 +96,7 @@ def search(
             found=found,
             broken=singular | nonfinite,
             finite=jnp.isfinite(residual),
+            by_chord=jnp.array(False),
         )
     flat, _, flat_fn = flattened(fn, start.guess)
     given, regularisation = root_finder.linear_solver, flat_of(start.regularisation)
@@ -129,6 +132,7 @@ def _by_chord(
         found=last.done,
         broken=jnp.array(False),
         finite=jnp.isfinite(last.defect),
+        by_chord=last.done,
     )
 
 
@@ -150,6 +154,7 @@ def _iterated(
         found=last.done,
         broken=last.broken,
         finite=jnp.isfinite(last.defect),
+        by_chord=jnp.array(False),
     )
 
 

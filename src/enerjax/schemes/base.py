@@ -206,8 +206,8 @@ class StepProblem(eqx.Module):
             return jnp.zeros((0,), state.q.dtype)
         return self.model.joint_rate(state.q, state.v, state.t)
 
-    def constraint_matrix(self, end: Increment) -> ConstraintMatrix | None:
-        """`B M^-1 B^T` in the middle of the step to `end`; `None` where it is of no use."""
+    def constraint_matrix(self, end: Increment) -> ConstraintMatrix:
+        """`B M^-1 B^T` in the middle of the step to `end`."""
         middle = self.start.q + 0.5 * self.h * end.rate
         return self.model.constraint_matrix(middle, self.middle_time)
 
@@ -366,7 +366,7 @@ class AbstractSchemeWithChord(AbstractOneSolveScheme[Z, P], Generic[Z, P]):
     """
 
     @abc.abstractmethod
-    def constraint_matrix(self, z: Z, problem: P) -> ConstraintMatrix | None:
+    def constraint_matrix(self, z: Z, problem: P) -> ConstraintMatrix:
         """The matrix of the constraints in the middle of the step that `z` describes."""
 
     @abc.abstractmethod

@@ -139,7 +139,7 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
         jump_rows = eqx.tree_at(lambda rows: rows.rate, z.jump, row)
         return JumpAndEnd(jump_rows, self._rows(z.end, problem, end, jump))
 
-    def constraint_matrix(self, z: _Unknowns, problem: _Problem) -> ConstraintMatrix | None:
+    def constraint_matrix(self, z: _Unknowns, problem: _Problem) -> ConstraintMatrix:
         return problem.step.constraint_matrix(_end_of(z))
 
     def chord(

@@ -111,9 +111,7 @@ class EnergyDecaying(AbstractSchemeWithChord[JumpAndEnd, StepProblem]):
             end=problem.rows(z.end, end, after),  # eq. (47a)
         )
 
-    def constraint_matrix(
-        self, z: JumpAndEnd, problem: StepProblem
-    ) -> ConstraintMatrix | None:
+    def constraint_matrix(self, z: JumpAndEnd, problem: StepProblem) -> ConstraintMatrix:
         return problem.constraint_matrix(z.end)
 
     def chord(

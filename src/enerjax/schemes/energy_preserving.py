@@ -63,9 +63,7 @@ class EnergyPreserving(AbstractSchemeWithChord[Increment, StepProblem]):
         load = problem.step_load(end, z)
         return problem.rows(z, end, gradient.less(load))  # eq. (14a, c)
 
-    def constraint_matrix(
-        self, z: Increment, problem: StepProblem
-    ) -> ConstraintMatrix | None:
+    def constraint_matrix(self, z: Increment, problem: StepProblem) -> ConstraintMatrix:
         return problem.constraint_matrix(z)
 
     def chord(

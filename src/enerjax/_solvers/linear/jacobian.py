@@ -48,7 +48,7 @@ class Full:
 
     def empty(self, size: int, dtype: Any) -> AbstractFactors:
         if self.solver is None:
-            return LU.empty(size, dtype)
+            return (Inverse if size <= SMALL else LU).empty(size, dtype)
         return LineaxFactors(self.solver, jnp.zeros((size, size), dtype))
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from ..._programs import jacobian_pattern, shape_of
+from ..._programs import Indices, jacobian_pattern, shape_of
 from .banded import block_sizes, coloured_products, column_colours
 from .blocks import BlockDiagonal, Symmetric
 from .dense import inverse
@@ -32,7 +32,7 @@ _WIDEST = 32
 _UNROLLED = 16
 
 
-class SchurTables:
+class SchurTables(Indices):
     """Where the entries of `B` and of `G` stand. Made while a program is traced.
 
     A row of `B` is stored as its parts in the blocks of `W` that it touches.
@@ -51,6 +51,7 @@ class SchurTables:
     """
 
     def __init__(self, pattern: csr_array, weight: Symmetric):
+        super().__init__(pattern.toarray().astype(bool))
         self.num_rows, size = shape_of(pattern)
         is_blocks = isinstance(weight, BlockDiagonal)
         blocks = weight.places.rows if is_blocks else np.arange(size)[None]
@@ -105,8 +106,6 @@ class SchurTables:
         num_parts = self.touched.shape[1]
         none = self.touched.size
         touched = [*map(list, self.touched), []]
-        empty = int(self.touched.max(initial=0)) if self.touched.size else 0
-        del empty
         places: list[dict[int, int]] = [
             {block: i * num_parts + k for k, block in enumerate(row)}
             for i, row in enumerate(touched)
