@@ -83,8 +83,9 @@ def _in_parts(
     """A step that has failed `before`, in `parts` steps, which are at `most` so many."""
     length = h / parts
 
-    def begin(state: State, length: Scalar) -> Memory:
-        return first_memory(scheme, model, state, length, *model.accelerations(state))
+    def begin(state: State, length: Scalar, may_chord: bool) -> Memory:
+        rates = model.accelerations(state)
+        return first_memory(scheme, model, state, length, *rates, may_chord=may_chord)
 
     def part(sofar: Solved, k: Scalar):
         unused = (sofar.result != RESULTS.successful) | (k >= parts)
@@ -107,11 +108,12 @@ def _in_parts(
         residual=before.residual,
         result=RESULTS.successful,
         roughness=before.roughness,
-        memory=begin(start, length),
+        # By Newton's method alone: a second program for rare steps would compile for long.
+        memory=begin(start, length, may_chord=False),
     )
     done, _ = jax.lax.scan(part, first, jnp.arange(most, dtype=h.dtype))
     state = _timed(done.end.state, start, h)
-    return eqx.tree_at(lambda done: done.memory, done, begin(state, h))
+    return eqx.tree_at(lambda done: done.memory, done, begin(state, h, may_chord=True))
 
 
 def _timed(state: State, start: State, passed: Scalar) -> State:

@@ -36,8 +36,8 @@ from ..schemes import (
 
 # Enough for the linear convergence of a locking step; a step that needs more has failed.
 MAX_ITERATIONS = 50
-# Steps before a chord iteration is tried again after one that has failed. What makes it fail
-# (stiff forces, fast turns) lasts for some steps, and trying costs two or three residuals.
+# Steps before a chord iteration is tried again after one that has failed. What makes it
+# fail (stiff forces, fast turns) lasts for some steps, and trying costs a few residuals.
 _CHORD_WAITS = 10
 
 
@@ -88,8 +88,9 @@ def first_memory(
     h: Scalar,
     acceleration: Velocities,
     multipliers: Multipliers,
+    may_chord: bool = True,
 ) -> Memory:
-    """The memory of a run that begins."""
+    """The memory of a run that begins; without `may_chord` no chord iteration is made."""
     carried = None
     if isinstance(scheme, AbstractSchemeWithMemory):
         carried = scheme.begin(model, start, h, acceleration)
@@ -98,7 +99,8 @@ def first_memory(
     flight = _free_flight(scheme, problem, model, start)
     added = jax.tree.map(lambda x, x0: jnp.stack([x - x0] * 3), z, flight)
     added = jax.lax.stop_gradient(added)
-    has_chord = isinstance(scheme, AbstractSchemeWithChord) and model.has_constraint_matrix
+    is_chord_scheme = isinstance(scheme, AbstractSchemeWithChord)
+    has_chord = may_chord and is_chord_scheme and model.has_constraint_matrix
     flat, _ = ravel_pytree(flight)
     factors = None if has_chord else kept_factors(flat.size, flat.dtype)
     return Memory(

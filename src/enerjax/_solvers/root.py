@@ -118,8 +118,8 @@ def find_root(
     their own size, down to `least`.
 
     With a `chord`, and if `by_chord`, `Newton` searches with its corrections first, and
-    with the exact Jacobian only where that search has failed. The root and its derivatives are those of
-    `fn` in any case.
+    with the exact Jacobian only where that search has failed. The root and its derivatives
+    are those of `fn` in any case.
     """
     flat, _ = ravel_pytree(guess)
     start = Start(

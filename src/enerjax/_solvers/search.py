@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 from typing_extensions import TypeAliasType
 
+from .._programs import in_one_function
 from .._types import Count, Flag, Scalar
 from .chord_iterations import chord_iterations
 from .linear.dense import AbstractFactors, Inverse
@@ -103,7 +104,9 @@ def search(
     exact = linearisable(flat_fn, flat, args, given, regularisation)
     if chord is None or given is not None:
         return _iterated(exact, root_finder, start, max_iterations)
-    first = _by_chord(exact, chord, root_finder, args, start)
+    # Apart: the search that follows it where it fails may not be possible in one function.
+    by_chord = lambda: _by_chord(exact, chord, root_finder, args, start)
+    first = in_one_function(by_chord)()
 
     def again() -> Root:
         # (The lanes of a batch all come here.)

@@ -7,6 +7,7 @@ meet only their neighbours. The elimination goes from block to block. `G` is sym
 positive definite, so the order of the blocks needs no pivoting.
 """
 
+import functools
 from collections.abc import Callable
 from itertools import pairwise
 
@@ -18,7 +19,7 @@ from jaxtyping import Array, Float
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from ..._programs import Indices, jacobian_pattern, shape_of
+from ..._programs import Indices, jacobian_pattern, shape_of, summed, unmerged
 from .banded import block_sizes, coloured_products, column_colours
 from .blocks import BlockDiagonal, Symmetric
 from .dense import inverse
@@ -44,8 +45,8 @@ class SchurTables(Indices):
       stands where there is none.
     - `entries`: where each entry stands in the coloured products, and `transposed`: where
       the entries of each unknown stand among those of `B`; beyond the last for zeros.
-    - `diagonal`, `below`: for each entry of the blocks of `G` the pairs of parts whose
-      products are summed up, `(2, blocks, width, width, pairs)`.
+    - `diagonal`, `below`: for each block of `G`, on the diagonal and below, where its rows
+      and those of its columns stand among the entries of `B`; see `_shared`.
     - `order`: the numbers of the rows along the blocks, `back`: where each row stands.
     - `filling`: ones on the diagonal where a block is smaller than the largest.
     """
@@ -98,33 +99,32 @@ class SchurTables(Indices):
         self.order[self.back] = np.arange(self.num_rows)
         along = self.order.reshape(self.num_blocks, self.width)
         self.filling = (along == self.num_rows)[:, :, None] * np.eye(self.width)
-        self.diagonal = self._pairs([(rows, rows) for rows in along])
-        self.below = self._pairs([(after, rows) for rows, after in pairwise(along)])
+        self.diagonal = self._shared([(rows, rows) for rows in along])
+        self.below = self._shared([(after, rows) for rows, after in pairwise(along)])
 
-    def _pairs(self, blocks: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        """The parts that pairs of rows share, as numbers among all parts."""
-        num_parts = self.touched.shape[1]
-        none = self.touched.size
-        touched = [*map(list, self.touched), []]
-        places: list[dict[int, int]] = [
-            {block: i * num_parts + k for k, block in enumerate(row)}
-            for i, row in enumerate(touched)
-        ]
+    def _shared(self, pairs: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+        """Where two blocks of rows stand in the unknowns that both touch.
+
+        For each pair the entries of the rows of either block among those of `B`, of shape
+        `(2, pairs, width, unknowns)`; beyond the last for zeros.
+        """
+        size, none = self.transposed.shape[0], self.columns.size
+        places = np.full((self.num_rows + 1, size + 1), none)
+        places[np.arange(self.num_rows)[:, None, None], self.columns] = np.arange(
+            none
+        ).reshape(self.columns.shape)
+        places[:, size] = none
+        touched = places < none
         shared = [
-            [
-                [(places[i][x], places[j][x]) for x in places[i] if x in places[j]]
-                for j in columns
-            ]
-            for rows, columns in blocks
-            for i in rows
+            np.flatnonzero(touched[a].any(axis=0) & touched[b].any(axis=0))
+            for a, b in pairs
         ]
-        most = max((len(x) for row in shared for x in row), default=1)
-        shape = (len(blocks), self.width, self.width)
-        table = np.full((2, len(blocks) * self.width, self.width, most), none)
-        for i, row in enumerate(shared):
-            for j, pairs in enumerate(row):
-                table[:, i, j, : len(pairs)] = np.array(pairs, int).reshape(-1, 2).T
-        return table.reshape(2, *shape, most)
+        most = max(map(len, shared), default=0)
+        table = np.full((2, len(pairs), self.width, most), none)
+        for k, (sides, columns) in enumerate(zip(pairs, shared, strict=True)):
+            for side, rows in enumerate(sides):
+                table[side, k, :, : columns.size] = places[rows][:, columns]
+        return table
 
 
 class Schur(eqx.Module):
@@ -137,12 +137,12 @@ class Schur(eqx.Module):
 
     def product(self, u: Float[Array, " n"]) -> Float[Array, " rows"]:
         """`B u`"""
-        return jnp.sum(self.rows * jnp.append(u, 0)[self.tables.columns], axis=(1, 2))
+        return summed(self.rows * jnp.append(u, 0)[self.tables.columns], 2)
 
     def transposed(self, x: Float[Array, " rows"]) -> Float[Array, " n"]:
         """`B^T x`"""
         entries = jnp.append((self.rows * x[:, None, None]).ravel(), 0)
-        return jnp.sum(entries[self.tables.transposed], axis=1)
+        return summed(entries[self.tables.transposed])
 
     def solve(self, right: Float[Array, "k rows"]) -> Float[Array, "k rows"]:
         """`G^-1` times some vectors."""
@@ -151,7 +151,7 @@ class Schur(eqx.Module):
         padded = jnp.concatenate([right, jnp.zeros((count, 1), right.dtype)], axis=1)
         along = padded[:, tables.order].reshape(count, tables.num_blocks, tables.width)
         along = jnp.moveaxis(along, 1, 0)
-        times = lambda matrix, x: jnp.sum(matrix * x[..., None, :], axis=-1)
+        times = lambda matrix, x: summed(matrix * x[..., None, :])
 
         def forward(before, item):
             factor, value = item
@@ -197,19 +197,9 @@ def schur(
 ) -> Schur:
     """`G` of the Jacobian of `fn` at a point."""
     products = coloured_products(fn, at, tables.colours)
-    rows = jnp.append(products.ravel(), 0)[tables.entries]
-    if isinstance(weight, BlockDiagonal):
-        none = jnp.zeros((1, *weight.blocks.shape[1:]), at.dtype)
-        blocks = jnp.concatenate([weight.blocks, none])[tables.touched]
-    else:
-        blocks = weight[None, None]
-    weighted = jnp.sum(blocks * rows[:, :, None, :], axis=-1)
-    flat = lambda x: jnp.concatenate(
-        [x.reshape(-1, x.shape[-1]), jnp.zeros((1, x.shape[-1]), x.dtype)]
-    )
-    left, right = flat(rows), flat(weighted)
-    entries = lambda table: jnp.sum(left[table[0]] * right[table[1]], axis=(-1, -2))
-    diagonal = entries(tables.diagonal) + jnp.asarray(tables.filling, at.dtype)
+    # The tables are read many times over: each of their entries is computed once.
+    rows, weighted = unmerged(functools.partial(_weighted, tables))(products, weight)
+    diagonal, below = _blocks(tables, rows, weighted)
     if tables.num_blocks == 1:
         none = jnp.zeros((0, tables.width, tables.width), at.dtype)
         return Schur(tables, rows, none, _inverse(diagonal[0])[None])
@@ -221,9 +211,35 @@ def schur(
         return found, (factor, found)
 
     first = _inverse(diagonal[0])
-    below = entries(tables.below)
     _, (factors, inverses) = jax.lax.scan(eliminate, first, (diagonal[1:], below))
     return Schur(tables, rows, factors, jnp.concatenate([first[None], inverses]))
+
+
+def _weighted(
+    tables: SchurTables, products: Float[Array, "rows colours"], weight: Symmetric
+) -> tuple[Array, Array]:
+    """The parts of `B`, and of `B W`."""
+    rows = jnp.append(products.ravel(), 0)[tables.entries]
+    if isinstance(weight, BlockDiagonal):
+        none = jnp.zeros((1, *weight.blocks.shape[1:]), rows.dtype)
+        blocks = jnp.concatenate([weight.blocks, none])[tables.touched]
+    else:
+        blocks = weight[None, None]
+    return rows, summed(blocks * rows[:, :, None, :])
+
+
+def _blocks(tables: SchurTables, rows: Array, weighted: Array) -> tuple[Array, Array]:
+    """The blocks of `G` on its diagonal and below."""
+    left, right = (jnp.append(x.ravel(), 0) for x in (weighted, rows))
+
+    def blocks(table: np.ndarray) -> Array:
+        one, other = unmerged(lambda x, y: (x[table[0]], y[table[1]]))(left, right)
+        terms = (one[:, :, None, k] * other[:, None, :, k] for k in range(table.shape[-1]))
+        shape = (table.shape[1], tables.width, tables.width)
+        return functools.reduce(jnp.add, terms, jnp.zeros(shape, rows.dtype))
+
+    filling = jnp.asarray(tables.filling, rows.dtype)
+    return blocks(tables.diagonal) + filling, blocks(tables.below)
 
 
 def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -242,4 +258,4 @@ def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def _times(a: Float[Array, "m n"], b: Float[Array, "n k"]) -> Float[Array, "m k"]:
-    return jnp.sum(a[:, :, None] * b[None], axis=1)
+    return summed(a[:, None, :] * b.T[None])
