@@ -64,7 +64,7 @@ FAULTS = (
         "        tiny=eps**0.5,\n",
         "A small correction that does not shrink ends a search at a residual of 1e-8.",
         of(
-            "simplified_search::test_slow_corrections_are_not_taken_for_round_off",
+            "chord::test_slow_corrections_are_not_taken_for_round_off",
             "extremes",
         ),
     ),

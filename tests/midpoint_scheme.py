@@ -9,7 +9,6 @@ from enerjax.schemes import (
     Formulation,
     Gradient,
     Increment,
-    Node,
     Reaction,
     StepEnd,
     StepProblem,
@@ -46,15 +45,15 @@ class Midpoint(AbstractOneSolveScheme[Increment, StepProblem]):
 
     def residual(self, z: Increment, problem: StepProblem) -> Increment:
         model, end = problem.model, self._end(z, problem)
-        middle = self._middle(z, problem, end.state)
+        middle = self._middle(z, problem, end)
         gradient = model.gradient(middle, problem.h)
         joints = model.constraint_force(middle.q, middle.t, z.impulse)
         reaction = model.reaction_row(middle, z.velocity_impulse)
         total = Gradient(gradient.impulse + joints, gradient.rate + reaction)
-        return problem.rows(z, end, total.less(problem.step_load(end.state, z)))
+        return problem.rows(z, end, total.less(problem.step_load(end, z)))
 
     def finish(self, z: Increment, problem: StepProblem) -> StepEnd:
-        end = self._end(z, problem).state
+        end = self._end(z, problem)
         drive_work = None
         if problem.model.system.driven is not None:
             middle = self._middle(z, problem, end)
@@ -71,7 +70,7 @@ class Midpoint(AbstractOneSolveScheme[Increment, StepProblem]):
         q = problem.start.q + 0.5 * problem.h * z.rate
         return State(q, 0.5 * (problem.start.v + end.v), problem.middle_time)
 
-    def _end(self, z: Increment, problem: StepProblem) -> Node:
+    def _end(self, z: Increment, problem: StepProblem) -> State:
         start, middle = problem.start, problem.start.q + 0.5 * problem.h * z.rate
 
         def velocity(reaction: Reaction) -> tuple[Array]:

@@ -232,3 +232,19 @@ def test_a_chain_that_cracks_like_a_whip_keeps_energy_and_constraints(num_links)
     assert np.ptp(run.audit.energy) <= 1e-11 * turnover  # solver
     assert np.max(np.abs(run.audit.constraint)) <= 1e-9 * length**2
     assert np.max(np.abs(run.audit.constraint_rate)) <= 1e-9 * length**2
+
+
+def test_a_band_is_cut_into_the_blocks_that_it_is_made_of():
+    """Blocks as wide as the band would be of seven unknowns."""
+    neighbours = np.abs(np.subtract.outer(np.arange(30), np.arange(30))) <= 1
+    rng = np.random.default_rng(0)
+    order = rng.permutation(120)
+    pattern = np.kron(neighbours, np.ones((4, 4)))[order][:, order]
+    band = Band(csr_array(pattern != 0))
+    assert band.width == 4
+    matrix = pattern * rng.normal(size=pattern.shape)
+    entries = band.evaluate(lambda x: jnp.asarray(matrix) @ x, jnp.zeros(120))
+    right = rng.normal(size=120)
+    x = band.empty(120, float).renewed(entries).solve(jnp.asarray(right))
+    size = np.abs(np.linalg.inv(matrix)).max()
+    np.testing.assert_allclose(matrix @ x, right, atol=1e4 * size * EPS)  # round-off

@@ -34,6 +34,7 @@ from .._discrete import AbstractCorrected, AbstractDerivative
 from .._solvers import Assembled, RowPattern, Symmetric
 from .._system import AbstractSystem, State
 from .._types import Args, Coordinates, JointMultipliers, Multipliers, Scalar, Velocities
+from .constraint_matrix import ConstraintMatrix
 from .interval import Gradient, Increment, Scales, Time, time_rate
 
 
@@ -56,6 +57,11 @@ class AbstractModel(eqx.Module):
     @abc.abstractmethod
     def has_own_momenta(self) -> bool:
         """Whether momenta are unknowns of the step; `State.v` is then `p`."""
+
+    @property
+    @abc.abstractmethod
+    def has_constraint_matrix(self) -> bool:
+        """Whether a chord iteration with `B M^-1 B^T` can solve the step equations."""
 
     @property
     @abc.abstractmethod
@@ -194,6 +200,10 @@ class AbstractModel(eqx.Module):
         work. Time counts as a coordinate whose momentum nothing depends on. With constant
         inertia the second part is empty; `stiffness_product` gives it.
         """
+
+    @abc.abstractmethod
+    def constraint_matrix(self, q: Coordinates, t: Time) -> ConstraintMatrix:
+        """`B M^-1 B^T` at a position, where `has_constraint_matrix`."""
 
     @abc.abstractmethod
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:

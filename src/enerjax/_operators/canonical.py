@@ -11,6 +11,7 @@ from .._solvers import affine_root, as_dense, Symmetric
 from .._system import AbstractCanonicalSystem, State
 from .._types import Args, Coordinates, JointMultipliers, Multipliers, Scalar, Velocities
 from .base import AbstractModel, Reaction
+from .constraint_matrix import ConstraintMatrix
 from .interval import Gradient, gradient_and_work, Increment, Scales, Time, time_rate
 
 
@@ -183,6 +184,13 @@ class CanonicalModel(AbstractModel):
         _, (force, rate, _) = jax.jvp(gradient, at, change)
         _, (force, rate, power) = jax.jvp(gradient, at, (rate / h, -force / h, no_time))
         return Gradient(force, rate / h, power)
+
+    @property
+    def has_constraint_matrix(self) -> bool:
+        return False
+
+    def constraint_matrix(self, q: Coordinates, t: Time) -> ConstraintMatrix:
+        raise NotImplementedError
 
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
         q, p, t = state.q, state.v, state.t

@@ -26,12 +26,16 @@ from .._solvers import (
     inverse_of,
     product,
     row_hessians,
+    schur,
+    schur_tables,
+    SchurTables,
     solve,
     Symmetric,
 )
 from .._system import AbstractKinematics, IdentityKinematics, State, System
 from .._types import Args, Coordinates, JointMultipliers, Multipliers, Scalar, Velocities
 from .base import AbstractModel, Reaction
+from .constraint_matrix import ConstraintMatrix
 from .elements import element_energies, gradient_and_work_by_rows, is_weight, Summands
 from .interval import Gradient, gradient_and_work, Increment, Scales, Time, time_rate
 
@@ -47,6 +51,8 @@ class SeparableModel(AbstractModel):
     # Whether the potential is linear; determined for large systems only.
     is_weight: bool = eqx.field(static=True)
     kinematics: AbstractKinematics
+    # Of `constraint_matrix`; `None` where there is none.
+    constraint_tables: SchurTables | None = eqx.field(static=True)
 
     def __init__(self, system: System, state: State, args: Args):
         self.system = system
@@ -56,6 +62,7 @@ class SeparableModel(AbstractModel):
         self.inertia = system.inertia(state, args)
         self.inverse_inertia = inverse_of(self.inertia)
         self.scales = self._scales(state)
+        self.constraint_tables = self._constraint_tables(state)
 
     @property
     def has_own_momenta(self) -> bool:
@@ -259,6 +266,25 @@ class SeparableModel(AbstractModel):
         force, power = self.stiffness_product(middle, multipliers, (dv, no_time))
         power = None if power is None else h * power
         return Gradient(h * force, dv[:0], power)
+
+    @property
+    def has_constraint_matrix(self) -> bool:
+        return self.constraint_tables is not None
+
+    def constraint_matrix(self, q: Coordinates, t: Time) -> ConstraintMatrix:
+        assert self.constraint_tables is not None
+        inverse_inertia, joint = self.inverse_inertia, lambda q: self.joint(q, t)
+        rows = schur(self.constraint_tables, joint, q, inverse_inertia)
+        return ConstraintMatrix(inverse_inertia, rows)
+
+    def _constraint_tables(self, state: State) -> SchurTables | None:
+        # Constraints that repeat each other make the matrix singular.
+        is_flat = self.has_canonical_rates and self.system.coordinate_constraint is None
+        if not is_flat or self.system.redundant:
+            return None
+        t = jnp.zeros((), state.q.dtype) if self.system.is_timed else None
+        joint = lambda q: self.joint(q, t)
+        return schur_tables(joint, state.q, self.inverse_inertia)
 
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
         """The constraints enter with their second derivatives in time.

@@ -6,7 +6,7 @@ from .indices import Indices as Indices
 from .lanes import in_any_lane as in_any_lane
 from .one_function.calls import in_one_function as in_one_function, unmerged as unmerged
 from .one_function.possible import LARGEST_SUM as LARGEST_SUM
-from .one_function.products import plain_products as plain_products
+from .one_function.products import plain_products as plain_products, summed as summed
 from .sparsity.columns import (
     columns_along as columns_along,
     jacobian_columns as jacobian_columns,

@@ -14,11 +14,11 @@ import jax.numpy as jnp
 from .._operators import AbstractModel
 from .._programs import in_any_lane
 from .._results import RESULTS
-from .._solvers import RootFinder
+from .._solvers import RootFinder, SMALL
 from .._system import State
 from .._types import Count, Flag, Scalar
 from ..schemes import AbstractOneSolveScheme, StepEnd
-from .stage import first_memory, Memory, solve, Solved
+from .stage import first_memory, Memory, num_unknowns, solve, Solved
 
 
 # The default for large systems: their steps take far longer than compiling the division.
@@ -42,7 +42,7 @@ def solve_or_divide(
     """
     whole = solve(scheme, model, start, h, memory, root_finder, skip)
     if max_halvings is None:
-        is_large = memory.factors is None
+        is_large = num_unknowns(memory) > SMALL
         max_halvings = _HALVINGS_OF_LARGE_SYSTEMS if is_large else 0
     none = jnp.array(0)
     if max_halvings == 0:
@@ -84,8 +84,9 @@ def _divided(
     """
     length = h / count
 
-    def begin(state: State, length: Scalar) -> Memory:
-        return first_memory(scheme, model, state, length, *model.accelerations(state))
+    def begin(state: State, length: Scalar, with_chord: bool) -> Memory:
+        rates = model.accelerations(state)
+        return first_memory(scheme, model, state, length, *rates, with_chord=with_chord)
 
     def one_step(sofar: Solved, k: Scalar):
         unused = (sofar.result != RESULTS.successful) | (k >= count)
@@ -108,11 +109,12 @@ def _divided(
         residual=before.residual,
         result=RESULTS.successful,
         roughness=before.roughness,
-        memory=begin(start, length),
+        # By Newton's method alone: a second program for rare steps would compile for long.
+        memory=begin(start, length, with_chord=False),
     )
     done, _ = jax.lax.scan(one_step, first, jnp.arange(max_count, dtype=h.dtype))
     state = _at_time(done.end.state, start, h)
-    return eqx.tree_at(lambda done: done.memory, done, begin(state, h))
+    return eqx.tree_at(lambda done: done.memory, done, begin(state, h, with_chord=True))
 
 
 def _at_time(state: State, start: State, passed: Scalar) -> State:

@@ -16,9 +16,11 @@ from .._operators import AbstractModel, Increment, roughness, scales_like, short
 from .._results import first_failure, from_root_finder, RESULTS
 from .._solvers import (
     AbstractFactors,
+    Chord,
     find_root,
     kept_factors,
     max_norm,
+    Root,
     RootFinder,
     RowPattern,
 )
@@ -26,14 +28,17 @@ from .._system import State
 from .._types import Count, Flag, Multipliers, Scalar, Velocities
 from ..schemes import (
     AbstractOneSolveScheme,
+    AbstractSchemeWithChord,
     AbstractSchemeWithMemory,
     StepEnd,
-    StepProblem,
 )
 
 
 # Enough for the linear convergence of a locking step; a step that needs more has failed.
 MAX_ITERATIONS = 50
+# Steps before a chord iteration is tried again after one that has failed. What makes it
+# fail (stiff forces, fast turns) lasts for some steps, and trying costs a few residuals.
+_CHORD_WAITS = 10
 
 
 class Memory(eqx.Module):
@@ -42,13 +47,17 @@ class Memory(eqx.Module):
     - `added`: what the last three steps added to a free flight, newest first.
     - `is_smooth`: whether extrapolating from these would have met the last step better
       than repeating.
-    - `factors`: of the Jacobians of the last three steps, newest first.
+    - `factors`: of the Jacobians of the last three steps, newest first; `None` for large
+      systems, and where a chord iteration has its own.
+    - `chord_wait`: how many steps are solved without trying a chord iteration; `None` where
+      there is none to try.
     - `carried`: what a scheme with a memory hands on; of others `None`.
     """
 
     added: PyTree[Any]
     is_smooth: Flag
     factors: AbstractFactors | None
+    chord_wait: Count | None
     carried: PyTree[Any]
 
 
@@ -79,8 +88,9 @@ def first_memory(
     h: Scalar,
     acceleration: Velocities,
     multipliers: Multipliers,
+    with_chord: bool = True,
 ) -> Memory:
-    """The memory of a run that begins."""
+    """The memory of a run that begins; without `with_chord` no chord iteration is made."""
     carried = None
     if isinstance(scheme, AbstractSchemeWithMemory):
         carried = scheme.begin(model, start, h, acceleration)
@@ -89,10 +99,17 @@ def first_memory(
     flight = _free_flight(scheme, problem, model, start)
     added = jax.tree.map(lambda x, x0: jnp.stack([x - x0] * 3), z, flight)
     added = jax.lax.stop_gradient(added)
+    is_chord_scheme = isinstance(scheme, AbstractSchemeWithChord)
+    has_chord = with_chord and is_chord_scheme and model.has_constraint_matrix
     flat, _ = ravel_pytree(flight)
-    factors = kept_factors(flat.size, flat.dtype)
-    factors = jax.tree.map(lambda x: jnp.stack([x] * 3), factors)
-    return Memory(added, jnp.array(True), factors, carried)
+    factors = None if has_chord else kept_factors(flat.size, flat.dtype)
+    return Memory(
+        added=added,
+        is_smooth=jnp.array(True),
+        factors=jax.tree.map(lambda x: jnp.stack([x] * 3), factors),
+        chord_wait=jnp.array(0) if has_chord else None,
+        carried=carried,
+    )
 
 
 def _problem(
@@ -128,19 +145,13 @@ def solve(
         z = jax.tree.map(jnp.multiply, x, unknown_scale)
         return jax.tree.map(jnp.divide, scheme.residual(z, problem), row_scale)
 
-    def scaled_with_weak_couplings_held(x, inputs):
-        scheme, problem, *scales = inputs
-        return scaled(x, (scheme, problem.with_weak_couplings_held(), *scales))
-
-    has_weak_couplings = (
-        isinstance(problem, StepProblem) and problem.weak_couplings == "exact"
-    )
     inputs = (scheme, problem, unknown_scale, row_scale)
 
     guess = jax.tree.map(
         lambda x0, x, s: (x0 + x) / s, flight, _predicted(memory), unknown_scale
     )
     scale_down = lambda z: jax.tree.map(jnp.divide, z, unknown_scale)
+    wait = memory.chord_wait
     root = find_root(
         scaled,
         root_finder,
@@ -154,7 +165,8 @@ def solve(
         skip=skip,
         regularisation=_regularisation(model, unknown_scale, row_scale),
         least=least,
-        jacobian_of=scaled_with_weak_couplings_held if has_weak_couplings else None,
+        chord=None if wait is None else _chord(scheme),
+        by_chord=True if wait is None else wait == 0,
     )
     z = jax.tree.map(jnp.multiply, root.value, unknown_scale)
     end = scheme.finish(z, problem)
@@ -168,8 +180,31 @@ def solve(
         residual=root.residual,
         result=first_failure(first_failure(end.result, found), turned),
         roughness=roughness(model.scales.coordinate, added, memory.added, unknown_scale),
-        memory=_memory_after(memory, added, unknown_scale, root.factors, end.carried),
+        memory=_memory_after(memory, added, unknown_scale, root, end.carried),
     )
+
+
+def _chord(scheme: AbstractOneSolveScheme) -> Chord:
+    """Corrections with inertia and constraints alone."""
+    assert isinstance(scheme, AbstractSchemeWithChord)
+
+    def prepare(x, inputs):
+        scheme, problem, unknown_scale, _ = inputs
+        z = jax.tree.map(jnp.multiply, x, unknown_scale)
+        return scheme.constraint_matrix(z, problem)
+
+    def correct(value, inputs, matrix):
+        scheme, problem, unknown_scale, row_scale = inputs
+        rows = jax.tree.map(jnp.multiply, value, row_scale)
+        correction = scheme.chord(rows, problem, matrix)
+        return jax.tree.map(jnp.divide, correction, unknown_scale)
+
+    return Chord(prepare, correct)
+
+
+def num_unknowns(memory: Memory) -> int:
+    """How many unknowns a solve has."""
+    return sum(x[0].size for x in jax.tree.leaves(memory.added))
 
 
 def _predicted(memory: Memory) -> PyTree[Any]:
@@ -193,7 +228,7 @@ def _memory_after(
     memory: Memory,
     added: PyTree[Any],
     unknown_scale: PyTree[Any],
-    factors: AbstractFactors | None,
+    root: Root,
     carried: PyTree[Any],
 ) -> Memory:
     """The memory with a step that added `added` to a free flight."""
@@ -206,9 +241,17 @@ def _memory_after(
     return Memory(
         added=jax.tree.map(_pushed, added, memory.added),
         is_smooth=error(smooth) <= error(last),
-        factors=jax.tree.map(_pushed, factors, memory.factors),
+        factors=jax.tree.map(_pushed, root.factors, memory.factors),
+        chord_wait=_wait_after(memory.chord_wait, root),
         carried=carried,
     )
+
+
+def _wait_after(wait: Count | None, root: Root) -> Count | None:
+    if wait is None:
+        return None
+    passed = jnp.where(root.by_chord, 0, _CHORD_WAITS)
+    return jnp.where(wait == 0, passed, wait - 1).astype(wait.dtype)
 
 
 def _next(x: Array) -> Array:

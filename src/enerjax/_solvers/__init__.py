@@ -14,6 +14,7 @@ from .linear.dense import (
     AbstractFactors as AbstractFactors,
     inverse as inverse,
     product as product,
+    SMALL as SMALL,
     solve as solve,
 )
 from .linear.independent_blocks import (
@@ -29,6 +30,12 @@ from .linear.jacobian import (
     RowPattern as RowPattern,
 )
 from .linear.norms import largest as largest
+from .linear.schur import (
+    Schur as Schur,
+    schur as schur,
+    schur_tables as schur_tables,
+    SchurTables as SchurTables,
+)
 from .linear.symmetric import cholesky as cholesky, eigh as eigh
 from .linear.user_solver import (
     AbstractSparseSolver as AbstractSparseSolver,
@@ -38,4 +45,4 @@ from .linear.user_solver import (
 from .newton import Newton as Newton
 from .newton_iterations import max_norm as max_norm
 from .root import find_root as find_root, ROOT as ROOT
-from .search import RootFinder as RootFinder
+from .search import Chord as Chord, Root as Root, RootFinder as RootFinder

@@ -14,6 +14,11 @@ from .linear.user_solver import AbstractSparseSolver
 class Newton(eqx.Module):
     """Newton's method on a problem scaled to order one, down to round-off.
 
+    It begins with a chord iteration where the system has constant inertia and `v = qdot`:
+    with the inertia and the gradients of the constraints in the middle of the step, whose
+    matrix is factorised once. Where that does not contract (stiff forces, fast turns) the
+    exact Jacobian follows.
+
     One Jacobian serves several corrections, with an approximate inverse that is
     extrapolated from those of the steps before, and improved. It is renewed where the
     corrections `c_k` would shrink by less than three; such a correction is not made. Where
@@ -35,8 +40,7 @@ class Newton(eqx.Module):
       differ from zero, or one of lineax, given the dense Jacobian. Without it size and
       structure decide: plain operations up to 32 unknowns, LAPACK, and above 64 the
       narrow band that the pattern of the equations can be numbered into, if there is one.
-      A scheme can name weak couplings without which the band is narrower: the search then
-      does without them, and begins again with them where it fails. Derivatives are exact.
+      Derivatives are exact.
 
     A `linear_solver` of another type raises a `TypeError`, a bound that is not positive a
     `ValueError`.
@@ -70,6 +74,7 @@ class Start(eqx.Module):
       without.
     - `factors`: of the Jacobian of the solve before, where it is kept.
     - `skip`: return the guess without an iteration.
+    - `by_chord`: whether to try a chord iteration first, where there is one.
     - `regularisation`: for each unknown, what is added to the diagonal of a Jacobian that
       may be singular; see `find_root`.
     - `least`: where all unknowns are smaller, it is by round-off.
@@ -79,5 +84,6 @@ class Start(eqx.Module):
     others: tuple[PyTree[Array], ...]
     factors: AbstractFactors | None
     skip: Flag
+    by_chord: Flag
     regularisation: PyTree[Array] | None
     least: Scalar

@@ -39,7 +39,7 @@ _STALLS = 4
 _LEAST_PART = 0.01
 
 
-class _Powers(NamedTuple):
+class Powers(NamedTuple):
     """Thresholds that depend on the precision: powers of the machine epsilon.
 
     - `floor`: the least size, as a part of the largest unknown, by which an unknown is
@@ -59,9 +59,10 @@ class _Powers(NamedTuple):
     round_off: float
 
 
-def _powers(dtype: jnp.dtype) -> _Powers:
+def powers_of(dtype: jnp.dtype) -> Powers:
+    """The thresholds for a precision."""
     eps = float(jnp.finfo(dtype).eps)
-    return _Powers(
+    return Powers(
         eps=eps,
         floor=eps**0.125,
         small=eps**0.25,
@@ -77,6 +78,20 @@ def _powers(dtype: jnp.dtype) -> _Powers:
 def max_norm(x: PyTree[Array]) -> Scalar:
     """The largest entry; for residuals and corrections, which are all scaled."""
     return largest(ravel_pytree(x)[0])
+
+
+def correction_size(
+    step: Float[Array, " n"], x: Float[Array, " n"], least: Scalar, powers: Powers
+) -> Scalar:
+    """The size of a correction that leads to `x`, relative to the unknowns.
+
+    Every unknown is compared with itself: one scale for all would hide a light, slow body
+    beside a heavy, fast one. The floor is for unknowns that pass through zero. It follows
+    the largest unknown, down to `least`, for where all unknowns are far smaller than their
+    scales.
+    """
+    floor = powers.floor * jnp.clip(largest(x), least, 1.0)
+    return largest(step / (jnp.abs(x) + floor))
 
 
 class _Iterate(eqx.Module):
@@ -167,7 +182,7 @@ def _attempt(
     damped: Flag | bool,
 ) -> _Iterate:
     """A search from one guess."""
-    powers = _powers(first.x.dtype)
+    powers = powers_of(first.x.dtype)
 
     def linearise(iterate: _Iterate) -> _Iterate:
         factors = iterate.factors.renewed(residual.jacobian(iterate.x))
@@ -180,7 +195,7 @@ def _attempt(
     def iteration(iterate: _Iterate) -> _Iterate:
         iterate = jax.lax.while_loop(lambda c: c.stale, linearise, iterate)
         correction = _propose(residual, iterate, start.least, powers)
-        verdict = _classify(iterate, correction, newton, residual.is_exact, powers)
+        verdict = _classify(iterate, correction, newton, powers)
         return _next_iterate(iterate, correction, verdict, damped, powers)
 
     unfinished = lambda c: (
@@ -216,17 +231,12 @@ class _Verdict(NamedTuple):
 
 
 def _propose(
-    residual: Linearisable, iterate: _Iterate, least: Scalar, powers: _Powers
+    residual: Linearisable, iterate: _Iterate, least: Scalar, powers: Powers
 ) -> _Correction:
     value = residual.value(iterate.x)
     step = iterate.factors.solve(value)
     x = iterate.x - step
-    # Every unknown is compared with itself: one scale for all would hide a light, slow
-    # body beside a heavy, fast one. The floor is for unknowns that pass through zero. It
-    # follows the largest unknown, down to `least`, for where all unknowns are far smaller
-    # than their scales.
-    floor = powers.floor * jnp.clip(largest(x), least, 1.0)
-    size = largest(step / (jnp.abs(x) + floor))
+    size = correction_size(step, x, least, powers)
     contraction = size / iterate.size
     shrinks = contraction < _SHRINKS
     return _Correction(
@@ -243,8 +253,7 @@ def _classify(
     iterate: _Iterate,
     correction: _Correction,
     newton: Newton,
-    is_exact: bool,
-    powers: _Powers,
+    powers: Powers,
 ) -> _Verdict:
     _, _, size, contraction, shrinks, defect = correction
     fresh, small = iterate.fresh, size <= powers.small
@@ -262,11 +271,10 @@ def _classify(
     # So has a correction with a new Jacobian that does not shrink. Where the residual is
     # not tiny (coordinates a million lengths from the origin) this must happen several
     # times in a row, and the residual must not be large: a residual can have a smallest
-    # value that is no root. Corrections with an inexact Jacobian may shrink slowly without
-    # having met round-off.
-    stalled = fresh & small & (~shrinks if is_exact else contraction >= 1)
+    # value that is no root.
+    stalled = fresh & small & ~shrinks
     stalls = jnp.where(fresh, jnp.where(stalled, iterate.stalls + 1, 0), iterate.stalls)
-    repeatedly = (stalls == _STALLS) & (defect <= powers.moderate) & is_exact
+    repeatedly = (stalls == _STALLS) & (defect <= powers.moderate)
     met = met | (stalled & ((defect <= powers.tiny) | repeatedly))
     done = (is_root | converged | met) & jnp.isfinite(size)
     return _Verdict(is_root, done, stalls)
@@ -277,7 +285,7 @@ def _next_iterate(
     correction: _Correction,
     verdict: _Verdict,
     damped: Flag | bool,
-    powers: _Powers,
+    powers: Powers,
 ) -> _Iterate:
     """Takes the correction, or halves the one before, or asks for a new Jacobian."""
     fresh, part = iterate.fresh, iterate.part

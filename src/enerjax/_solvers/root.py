@@ -15,12 +15,12 @@ from jax.ad_checkpoint import checkpoint_name
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from .._programs import in_one_function, is_known, LARGE
+from .._programs import in_one_function, is_known
 from .._types import Flag, Scalar
 from .linear.dense import AbstractFactors
-from .linear.jacobian import kept_factors, Linearisable, linearisable
+from .linear.jacobian import Linearisable, linearisable
 from .newton import Newton, Start
-from .search import flat_of, flattened, Root, RootFinder, search
+from .search import Chord, flat_of, flattened, Root, RootFinder, search
 
 
 # The name under which a policy of `jax.checkpoint` knows the value of a root.
@@ -28,16 +28,16 @@ ROOT = "enerjax_root"
 
 
 @eqx.filter_custom_jvp
-def _root(fn, jacobian_of, root_finder, args, start, max_iterations):
-    return search(fn, jacobian_of, root_finder, args, start, max_iterations)
+def _root(fn, chord, root_finder, args, start, max_iterations):
+    return search(fn, chord, root_finder, args, start, max_iterations)
 
 
 @_root.def_jvp
 def _root_jvp(primals, tangents):
-    fn, jacobian_of, root_finder, args, start, max_iterations = primals
+    fn, chord, root_finder, args, start, max_iterations = primals
     t_args = tangents[3]
     # Apart: derivatives neither trace nor need how it is found.
-    again = lambda: _root(fn, jacobian_of, root_finder, args, start, max_iterations)
+    again = lambda: _root(fn, chord, root_finder, args, start, max_iterations)
     root = in_one_function(again)()
     # All that the derivatives of a step need of the search for it.
     root = eqx.tree_at(
@@ -100,7 +100,8 @@ def find_root(
     skip: Flag | bool = False,
     regularisation: PyTree[Array] | None = None,
     least: Scalar | float = 1.0,
-    jacobian_of: Callable[[PyTree[Array], Any], PyTree[Array]] | None = None,
+    chord: Chord | None = None,
+    by_chord: Flag | bool = True,
 ) -> Root:
     """The root of `fn(y, args)`. Never raises.
 
@@ -116,29 +117,33 @@ def find_root(
     derivatives. If all unknowns turn out smaller than one, they are resolved relative to
     their own size, down to `least`.
 
-    `jacobian_of(y, args)` is a function whose Jacobian approximates that of `fn`, for
-    example `fn` with `jax.lax.stop_gradient` around weak couplings. Where it is a narrower
-    band, `Newton` searches with it, and with the exact Jacobian only where that search has
-    failed. The root and its derivatives are those of `fn` in any case.
+    With a `chord`, and if `by_chord`, `Newton` searches with its corrections first, and
+    with the exact Jacobian only where that search has failed. The root and its derivatives
+    are those of `fn` in any case.
     """
     flat, _ = ravel_pytree(guess)
     start = Start(
         guess=guess,
         others=tuple(others),
-        factors=kept_factors(flat.size, flat.dtype) if factors is None else factors,
+        factors=factors,
         skip=jnp.asarray(skip),
+        by_chord=jnp.asarray(by_chord),
         regularisation=regularisation,
         least=jnp.asarray(least, flat.dtype),
     )
     start = jax.lax.stop_gradient(start)
     traced, opened = _opened(fn, guess, args)
     call = lambda y, inputs: opened(inputs[0], y, inputs[1])
-    narrow, traced_too = None, None
-    if jacobian_of is not None and flat.size > LARGE:
-        traced_too, opened_too = _opened(jacobian_of, guess, args)
-        narrow = lambda y, inputs: opened_too(inputs[2], y, inputs[1])
-    inputs = traced, args, traced_too, regularisation
-    return _root(call, narrow, root_finder, inputs, start, max_iterations)
+    of_chord = None
+    if chord is not None:
+        of_chord, prepare = _opened(chord.prepare, guess, args)
+        correct = chord.correct
+        chord = Chord(
+            lambda y, inputs: prepare(inputs[2], y, inputs[1]),
+            lambda value, inputs, prepared: correct(value, inputs[1], prepared),
+        )
+    inputs = traced, args, of_chord, regularisation
+    return _root(call, chord, root_finder, inputs, start, max_iterations)
 
 
 def _opened(fn: Callable, *like: Any) -> tuple[Any, Callable]:

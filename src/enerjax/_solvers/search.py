@@ -1,7 +1,7 @@
 """The search for a root: by Newton's method, or by a root finder of optimistix."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,16 +11,29 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 from typing_extensions import TypeAliasType
 
+from .._programs import in_one_function
 from .._types import Count, Flag, Scalar
+from .chord_iterations import chord_iterations
 from .linear.dense import AbstractFactors, Inverse
-from .linear.jacobian import Linearisable, linearisable, narrowed
+from .linear.jacobian import Linearisable, linearisable
 from .newton import Newton, Start
-from .newton_iterations import max_norm, newton_iterations, PATIENCE
+from .newton_iterations import max_norm, newton_iterations
 
 
 RootFinder = TypeAliasType(
     "RootFinder", Newton | optx.AbstractRootFinder | optx.AbstractLeastSquaresSolver
 )
+
+
+class Chord(NamedTuple):
+    """Corrections with a matrix that is close to the Jacobian and is known in closed form.
+
+    - `prepare(y, args)`: what all corrections of a search share, found near the guess `y`.
+    - `correct(value, args, prepared)`: the correction of a residual.
+    """
+
+    prepare: Callable[[PyTree[Array], Any], PyTree]
+    correct: Callable[[PyTree[Array], Any, PyTree], PyTree[Array]]
 
 
 class Root(eqx.Module):
@@ -33,6 +46,7 @@ class Root(eqx.Module):
     - `found`: whether they converged.
     - `broken`: whether they became singular or non-finite.
     - `finite`: whether the residual is.
+    - `by_chord`: whether a chord iteration has found it.
     """
 
     value: PyTree[Array]
@@ -42,6 +56,7 @@ class Root(eqx.Module):
     found: Flag
     broken: Flag
     finite: Flag
+    by_chord: Flag
 
 
 def flattened(fn: Callable, value: PyTree[Array]) -> tuple[Array, Callable, Callable]:
@@ -56,7 +71,7 @@ def flat_of(regularisation: PyTree[Array] | None) -> Array | None:
 
 def search(
     fn: Callable[[PyTree[Array], Any], PyTree[Array]],
-    jacobian_of: Callable[[PyTree[Array], Any], PyTree[Array]] | None,
+    chord: Chord | None,
     root_finder: RootFinder,
     args: PyTree,
     start: Start,
@@ -82,26 +97,46 @@ def search(
             found=found,
             broken=singular | nonfinite,
             finite=jnp.isfinite(residual),
+            by_chord=jnp.array(False),
         )
     flat, _, flat_fn = flattened(fn, start.guess)
     given, regularisation = root_finder.linear_solver, flat_of(start.regularisation)
-    exact, narrow = linearisable(flat_fn, flat, args, given, regularisation), None
-    if jacobian_of is not None and given is None:
-        _, _, flat_jacobian_of = flattened(jacobian_of, start.guess)
-        narrow = narrowed(exact, flat_jacobian_of, flat, args)
-    if narrow is None:
+    exact = linearisable(flat_fn, flat, args, given, regularisation)
+    if chord is None or given is not None:
         return _iterated(exact, root_finder, start, max_iterations)
-    alone = eqx.tree_at(lambda start: start.others, start, ())
-    first = _iterated(narrow, root_finder, alone, PATIENCE)
+    # Apart: the search that follows it where it fails may not be possible in one function.
+    by_chord = lambda: _by_chord(exact, chord, root_finder, args, start)
+    first = in_one_function(by_chord)()
 
     def again() -> Root:
         # (The lanes of a batch all come here.)
         left = eqx.tree_at(lambda start: start.skip, start, start.skip | first.found)
         last = _iterated(exact, root_finder, left, max_iterations)
-        total = first.iterations + last.iterations
-        return eqx.tree_at(lambda root: root.iterations, last, total)
+        last = eqx.tree_at(
+            lambda root: root.iterations, last, last.iterations + first.iterations
+        )
+        return jax.tree.map(lambda x, y: jnp.where(first.found, x, y), first, last)
 
     return jax.lax.cond(first.found, lambda: first, again)
+
+
+def _by_chord(
+    residual: Linearisable, chord: Chord, newton: Newton, args: PyTree, start: Start
+) -> Root:
+    guess, unravel = ravel_pytree(start.guess)
+    prepared = chord.prepare(start.guess, args)
+    solve = lambda right: ravel_pytree(chord.correct(unravel(right), args, prepared))[0]
+    last = chord_iterations(residual.value, solve, newton, start, guess)
+    return Root(
+        value=unravel(last.x),
+        factors=start.factors,
+        iterations=last.corrections,
+        residual=last.defect,
+        found=last.done,
+        broken=jnp.array(False),
+        finite=jnp.isfinite(last.defect),
+        by_chord=last.done,
+    )
 
 
 def _iterated(
@@ -122,6 +157,7 @@ def _iterated(
         found=last.done,
         broken=last.broken,
         finite=jnp.isfinite(last.defect),
+        by_chord=jnp.array(False),
     )
 
 

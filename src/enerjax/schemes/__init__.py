@@ -14,11 +14,11 @@ from .._results import RESULTS as RESULTS
 from .base import (
     AbstractOneSolveScheme as AbstractOneSolveScheme,
     AbstractScheme as AbstractScheme,
+    AbstractSchemeWithChord as AbstractSchemeWithChord,
     AbstractSchemeWithMemory as AbstractSchemeWithMemory,
     Energies as Energies,
     ForceLaw as ForceLaw,
     Formulation as Formulation,
-    Node as Node,
     StepEnd as StepEnd,
     StepProblem as StepProblem,
 )

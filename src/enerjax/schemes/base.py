@@ -1,7 +1,6 @@
 """What a scheme is, and the data, the rows and the end of one of its steps."""
 
 import abc
-import dataclasses
 from collections.abc import Callable
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
@@ -13,6 +12,7 @@ from jaxtyping import Array, Float, PyTree
 from .._discrete import AbstractDerivative, ChainRule
 from .._operators import (
     AbstractModel,
+    ConstraintMatrix,
     Gradient,
     Increment,
     Reaction,
@@ -54,22 +54,6 @@ class Energies(eqx.Module):
     drive_work: Float[Array, "..."] | None
 
 
-class Node(eqx.Module):
-    """A node of a step, as each part of the step equations sees it.
-
-    The three states have the same values. They differ only while weak couplings are held,
-    and then only in their derivatives; see `StepProblem`.
-
-    - `state`: for the balance of momentum and the constraints.
-    - `in_gradient`: for the discrete gradient.
-    - `in_joint_rate`: for the constraints at velocity level.
-    """
-
-    state: State
-    in_gradient: State
-    in_joint_rate: State
-
-
 class StepProblem(eqx.Module):
     """Everything that is known when a step starts.
 
@@ -78,14 +62,6 @@ class StepProblem(eqx.Module):
     - `h`: the length of the step, a scalar (time); negative in a backward stage.
     - `derivative`: the discrete gradient; schemes that take none leave the default.
     - `formulation`: the levels at which joints are imposed, `"ggl"` or `"index3"`.
-    - `weak_couplings`: whether the reaction `M^-1 C^T eta` in the velocities is
-      differentiated. It couples a body with the neighbours of its neighbours, but weakly,
-      because `eta` is small; without it the Jacobian of a large system is a narrower band.
-      `"absent"`: the scheme has no such coupling, or makes no use of this. `"exact"`: all
-      is differentiated. `"held"`: `jax.lax.stop_gradient` is applied to `C` in the
-      velocity-level constraints and to the whole reaction in the discrete gradient, where
-      it has a factor `eta`. Values are the same, and a search that converges with such a
-      Jacobian finds the same root.
     """
 
     model: AbstractModel
@@ -93,9 +69,6 @@ class StepProblem(eqx.Module):
     h: Scalar
     derivative: AbstractDerivative = ChainRule()
     formulation: Formulation = eqx.field(default="ggl", static=True)
-    weak_couplings: Literal["absent", "exact", "held"] = eqx.field(
-        default="absent", static=True
-    )
 
     @classmethod
     def with_constant_inertia(
@@ -121,10 +94,6 @@ class StepProblem(eqx.Module):
             "`EnergyDecaying`, or compare on points, directors (`bodies.RigidBody`) or "
             "planar bodies."
         )
-
-    def with_weak_couplings_held(self) -> "StepProblem":
-        """The same problem for the Jacobians of a search."""
-        return dataclasses.replace(self, weak_couplings="held")
 
     @property
     def separable_model(self) -> SeparableModel:
@@ -159,32 +128,18 @@ class StepProblem(eqx.Module):
         self,
         velocities: Callable[[Reaction], tuple[Velocities, ...]],
         *ends: tuple[Increment, Time],
-    ) -> tuple[Node, ...]:
-        """The nodes that increments lead to, each given with its time.
+    ) -> tuple[State, ...]:
+        """The states at the nodes that increments lead to, each given with its time.
 
         `velocities(reaction)` returns the velocities at the nodes, solved from the rows
         `S_mu`, where `reaction(q, t, eta)` is `M^-1 C(q, t)^T eta`. It is not called where
         momenta are unknowns.
         """
-        model, hold = self.model, jax.lax.stop_gradient
         momenta = tuple(z.momentum for z, _ in ends)
-
-        def states(change: Callable[[Reaction], Reaction]) -> list[State]:
-            found = model.node_momenta(
-                momenta, lambda reaction: velocities(change(reaction))
-            )
-            return [
-                State(self.position(z), v, t) for (z, t), v in zip(ends, found, strict=True)
-            ]
-
-        exact = states(lambda reaction: reaction)
-        if self.weak_couplings != "held":
-            return tuple(Node(state, state, state) for state in exact)
-        gradients_held = states(
-            lambda reaction: lambda q, t, eta: reaction(hold(q), t, eta)
+        found = self.model.node_momenta(momenta, velocities)
+        return tuple(
+            State(self.position(z), v, t) for (z, t), v in zip(ends, found, strict=True)
         )
-        all_held = states(lambda reaction: lambda q, t, eta: hold(reaction(q, t, eta)))
-        return tuple(map(Node, exact, all_held, gradients_held))
 
     def discrete_gradient(self, a: State, b: State, increment: Increment) -> Gradient:
         """The discrete gradient over `a -> b` with the multipliers of `increment`."""
@@ -251,15 +206,20 @@ class StepProblem(eqx.Module):
             return jnp.zeros((0,), state.q.dtype)
         return self.model.joint_rate(state.q, state.v, state.t)
 
-    def rows(self, z: Increment, node: Node, gradient: Gradient) -> Increment:
+    def constraint_matrix(self, end: Increment) -> ConstraintMatrix:
+        """`B M^-1 B^T` in the middle of the step to `end`."""
+        middle = self.start.q + 0.5 * self.h * end.rate
+        return self.model.constraint_matrix(middle, self.middle_time)
+
+    def rows(self, z: Increment, state: State, gradient: Gradient) -> Increment:
         """The rows of one node: the structure residual, and the constraints there."""
-        state, h = node.state, self.h
+        h = self.h
         balance, rates = self.model.structure(self.start, state, h, z.rate, gradient)
         return Increment(
             impulse=self.model.constraint(state.q, state.t) / h,
             rate=balance,
             momentum=rates,
-            velocity_impulse=self.joint_rate(node.in_joint_rate),
+            velocity_impulse=self.joint_rate(state),
         )
 
     def rows_of_balance(self, balance: Coordinates, end: State) -> Increment:
@@ -393,3 +353,22 @@ class AbstractSchemeWithMemory(AbstractOneSolveScheme[Z, P], Generic[Z, P]):
     @abc.abstractmethod
     def resume(self, problem: P, carried: PyTree[Any]) -> P:
         """The data of a step, with what the step before has carried into it."""
+
+
+class AbstractSchemeWithChord(AbstractOneSolveScheme[Z, P], Generic[Z, P]):
+    """A scheme whose equations can be solved nearly, by inertia and constraints alone.
+
+    The Jacobian of the step equations differs from the matrix of inertia and gradients of
+    the constraints by terms of the size `h^2` times stiffness over inertia. Where these are
+    small, a chord iteration with that matrix converges quickly, and its linear systems are
+    those of `B M^-1 B^T`: a search begins so, with constant inertia and `v = qdot`, and
+    goes on with the exact Jacobian where that fails.
+    """
+
+    @abc.abstractmethod
+    def constraint_matrix(self, z: Z, problem: P) -> ConstraintMatrix:
+        """The matrix of the constraints in the middle of the step that `z` describes."""
+
+    @abc.abstractmethod
+    def chord(self, rows: Z, problem: P, constraints: ConstraintMatrix) -> Z:
+        """The unknowns that the linearised step equations map to `rows`, nearly."""

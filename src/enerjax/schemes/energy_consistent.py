@@ -5,15 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._discrete import AbstractDerivative, MeanValue
-from .._operators import AbstractModel, Gradient, Increment, Reaction
+from .._operators import AbstractModel, ConstraintMatrix, Gradient, Increment, Reaction
 from .._programs import is_known
 from .._solvers import Assembled
 from .._system import State
 from .._types import Multipliers, Real, Scalar, Velocities
 from ._arguments import alpha_from_spectral_radius, as_alpha, check_derivative
+from ._chord import step_chord
 from ._discontinuous import JumpAndEnd
 from ._dissipative_stiffness import dissipative_stiffness, DissipativeStiffness
-from .base import AbstractOneSolveScheme, Formulation, Node, StepEnd, StepProblem
+from .base import AbstractSchemeWithChord, Formulation, StepEnd, StepProblem
 
 
 # The end of the step; for large systems also the jump of the velocities.
@@ -25,7 +26,7 @@ class _Problem(eqx.Module):
     dissipative: DissipativeStiffness
 
 
-class EnergyConsistent(AbstractOneSolveScheme[_Unknowns, _Problem]):
+class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
     r"""One interval, order 4 or 3, and decay for any potential.
 
     The jump `j` of the discontinuous schemes in closed form, so that the unknowns are
@@ -132,16 +133,37 @@ class EnergyConsistent(AbstractOneSolveScheme[_Unknowns, _Problem]):
             self._alpha(problem.step.h),
         )
         # (M + tau^2 K+) j_v - (h/6) K+ (dq + tau dv)
-        dv = end.state.v - step.start.v
+        dv = end.v - step.start.v
         moved = step.h * z.end.rate + alpha * step.h / 6 * (dv - alpha * jump)
         row = dissipative.inertia @ jump - step.h / 6 * (dissipative.matrix @ moved)
         jump_rows = eqx.tree_at(lambda rows: rows.rate, z.jump, row)
         return JumpAndEnd(jump_rows, self._rows(z.end, problem, end, jump))
 
+    def constraint_matrix(self, z: _Unknowns, problem: _Problem) -> ConstraintMatrix:
+        return problem.step.constraint_matrix(_end_of(z))
+
+    def chord(
+        self, rows: _Unknowns, problem: _Problem, constraints: ConstraintMatrix
+    ) -> _Unknowns:
+        if not isinstance(rows, JumpAndEnd):
+            return step_chord(rows, constraints)
+        # The jump of the velocities is an unknown too, which lowers those at the end.
+        jump = constraints.inverse_inertia @ rows.jump.rate
+        end = eqx.tree_at(
+            lambda end: (end.rate, end.velocity_impulse),
+            rows.end,
+            (
+                rows.end.rate + rows.jump.rate,
+                rows.end.velocity_impulse + constraints.product(jump),
+            ),
+        )
+        jumps = eqx.tree_at(lambda rows: rows.rate, rows.jump, jump)
+        return JumpAndEnd(jumps, step_chord(end, constraints))
+
     def finish(self, z: _Unknowns, problem: _Problem) -> StepEnd:
         step, dissipative, h = problem.step, problem.dissipative, problem.step.h
-        node, jump_v = self._end_and_jump(z, problem)
-        end, z, alpha = node.state, _end_of(z), self._alpha(h)
+        end, jump_v = self._end_and_jump(z, problem)
+        z, alpha = _end_of(z), self._alpha(h)
         dv = self._velocity_change(end, problem)
         jump_q = -h / 6 * (dv - alpha * jump_v)
         size = jump_q @ (dissipative.matrix @ jump_q)
@@ -159,12 +181,12 @@ class EnergyConsistent(AbstractOneSolveScheme[_Unknowns, _Problem]):
         )
 
     def _rows(
-        self, z: Increment, problem: _Problem, end: Node, jump_v: Velocities
+        self, z: Increment, problem: _Problem, end: State, jump_v: Velocities
     ) -> Increment:
         step, dissipative, h = problem.step, problem.dissipative, problem.step.h
-        gradient = step.discrete_gradient(step.start, end.in_gradient, z)
-        gradient = gradient.less(step.step_load(end.state, z))
-        skew = self._skew_gradient(z, step, end.state)
+        gradient = step.discrete_gradient(step.start, end, z)
+        gradient = gradient.less(step.step_load(end, z))
+        skew = self._skew_gradient(z, step, end)
         # What `(j(alpha) - j(0))/2`, with P, adds to both parts of the gradient.
         force = h**2 / 12 * self._alpha(h) * (dissipative.matrix @ jump_v)
         undamped = dissipative.inverse_inertia @ (dissipative.matrix @ (h**2 / 6 * z.rate))
@@ -175,7 +197,7 @@ class EnergyConsistent(AbstractOneSolveScheme[_Unknowns, _Problem]):
         )
         return step.rows(z, end, total)
 
-    def _end_and_jump(self, z: _Unknowns, problem: _Problem) -> tuple[Node, Velocities]:
+    def _end_and_jump(self, z: _Unknowns, problem: _Problem) -> tuple[State, Velocities]:
         """The end of the step, and the jump `j_v` of the velocities."""
         step, dissipative, h = problem.step, problem.dissipative, problem.step.h
         jump_v = z.jump.rate if isinstance(z, JumpAndEnd) else None
@@ -199,7 +221,7 @@ class EnergyConsistent(AbstractOneSolveScheme[_Unknowns, _Problem]):
 
         (end,) = step.nodes(velocity, (z, t1))
         if jump_v is None:
-            dv = self._velocity_change(end.state, problem)
+            dv = self._velocity_change(end, problem)
             jump_v = dissipative.jump_matrix @ (dq + self._alpha(h) * h / 6 * dv)
         return end, jump_v
 

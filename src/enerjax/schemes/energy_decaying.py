@@ -1,7 +1,7 @@
 import equinox as eqx
 
 from .._discrete import AbstractDerivative, ChainRule
-from .._operators import AbstractModel, Reaction
+from .._operators import AbstractModel, ConstraintMatrix, Reaction
 from .._system import State
 from .._types import Multipliers, Real, Scalar, Velocities
 from ._arguments import (
@@ -10,6 +10,7 @@ from ._arguments import (
     check_derivative,
     check_formulation,
 )
+from ._chord import jump_chord
 from ._discontinuous import (
     jump_energy,
     jump_gradient,
@@ -19,10 +20,10 @@ from ._discontinuous import (
     predict_jump_and_end,
     split_velocities,
 )
-from .base import AbstractOneSolveScheme, Formulation, Node, StepEnd, StepProblem
+from .base import AbstractSchemeWithChord, Formulation, StepEnd, StepProblem
 
 
-class EnergyDecaying(AbstractOneSolveScheme[JumpAndEnd, StepProblem]):
+class EnergyDecaying(AbstractSchemeWithChord[JumpAndEnd, StepProblem]):
     """Discontinuous Galerkin scheme: the energy decays by `alpha` times a jump.
 
     The state jumps from `z0` to `zj` at the start of the step and moves on to `z1`:
@@ -88,9 +89,7 @@ class EnergyDecaying(AbstractOneSolveScheme[JumpAndEnd, StepProblem]):
         return False
 
     def problem(self, model: AbstractModel, start: State, h: Scalar) -> StepProblem:
-        return StepProblem(
-            model, start, h, self.derivative, self.formulation, weak_couplings="exact"
-        )
+        return StepProblem(model, start, h, self.derivative, self.formulation)
 
     def predict(
         self, problem: StepProblem, acceleration: Velocities, multipliers: Multipliers
@@ -100,20 +99,28 @@ class EnergyDecaying(AbstractOneSolveScheme[JumpAndEnd, StepProblem]):
     def residual(self, z: JumpAndEnd, problem: StepProblem) -> JumpAndEnd:
         model, start, h = problem.model, problem.start, problem.h
         jump, end = self._nodes(z, problem)
-        loads = jump_loads(self.alpha, z, problem, jump.state, end.state)
-        after = problem.discrete_gradient(jump.in_gradient, end.in_gradient, z.end)
-        before = problem.discrete_gradient(start, jump.in_gradient, z.jump)
+        loads = jump_loads(self.alpha, z, problem, jump, end)
+        after = problem.discrete_gradient(jump, end, z.end)
+        before = problem.discrete_gradient(start, jump, z.jump)
         after, before = after.less(loads.after), before.less(loads.before)
         at_start = model.gradient(start, h).less(loads.start)
-        at_jump = model.gradient(jump.state, h).less(loads.jump)
+        at_jump = model.gradient(jump, h).less(loads.jump)
         to_jump = jump_gradient(self.alpha, after, before, at_start, at_jump)
         return JumpAndEnd(
             jump=problem.rows(z.jump, jump, to_jump),  # eq. (47b)
             end=problem.rows(z.end, end, after),  # eq. (47a)
         )
 
+    def constraint_matrix(self, z: JumpAndEnd, problem: StepProblem) -> ConstraintMatrix:
+        return problem.constraint_matrix(z.end)
+
+    def chord(
+        self, rows: JumpAndEnd, problem: StepProblem, constraints: ConstraintMatrix
+    ) -> JumpAndEnd:
+        return jump_chord(self.alpha, rows, constraints)
+
     def finish(self, z: JumpAndEnd, problem: StepProblem) -> StepEnd:
-        jump, end = (node.state for node in self._nodes(z, problem))
+        jump, end = self._nodes(z, problem)
         kinetic, potential = jump_energy(problem, jump)
         dissipated = self.alpha.astype(kinetic.dtype) * (kinetic + potential)
         work = jump_work(self.alpha, z, problem, jump, end)
@@ -125,7 +132,7 @@ class EnergyDecaying(AbstractOneSolveScheme[JumpAndEnd, StepProblem]):
             energies=problem.account(dissipated, work, drive_work),
         )
 
-    def _nodes(self, z: JumpAndEnd, problem: StepProblem) -> tuple[Node, ...]:
+    def _nodes(self, z: JumpAndEnd, problem: StepProblem) -> tuple[State, ...]:
         """The nodes after the jump, which takes no time, and at the end."""
         model, start = problem.model, problem.start
         qj, q1 = problem.position(z.jump), problem.position(z.end)

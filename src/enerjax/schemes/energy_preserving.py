@@ -2,14 +2,15 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._discrete import AbstractDerivative, ChainRule
-from .._operators import AbstractModel, Increment, Reaction
+from .._operators import AbstractModel, ConstraintMatrix, Increment, Reaction
 from .._system import State
 from .._types import Multipliers, Scalar, Velocities
 from ._arguments import check_derivative, check_formulation
-from .base import AbstractOneSolveScheme, Formulation, Node, StepEnd, StepProblem
+from ._chord import step_chord
+from .base import AbstractSchemeWithChord, Formulation, StepEnd, StepProblem
 
 
-class EnergyPreserving(AbstractOneSolveScheme[Increment, StepProblem]):
+class EnergyPreserving(AbstractSchemeWithChord[Increment, StepProblem]):
     """Continuous Galerkin scheme: keeps the total energy, damps nothing.
 
     Solves `S(z0, z1, DH(z0, z1)) = 0` with the constraints at the end of the step.
@@ -49,9 +50,7 @@ class EnergyPreserving(AbstractOneSolveScheme[Increment, StepProblem]):
         return True
 
     def problem(self, model: AbstractModel, start: State, h: Scalar) -> StepProblem:
-        return StepProblem(
-            model, start, h, self.derivative, self.formulation, weak_couplings="exact"
-        )
+        return StepProblem(model, start, h, self.derivative, self.formulation)
 
     def predict(
         self, problem: StepProblem, acceleration: Velocities, multipliers: Multipliers
@@ -60,12 +59,20 @@ class EnergyPreserving(AbstractOneSolveScheme[Increment, StepProblem]):
 
     def residual(self, z: Increment, problem: StepProblem) -> Increment:
         end = self._end(z, problem)
-        gradient = problem.discrete_gradient(problem.start, end.in_gradient, z)
-        load = problem.step_load(end.state, z)
+        gradient = problem.discrete_gradient(problem.start, end, z)
+        load = problem.step_load(end, z)
         return problem.rows(z, end, gradient.less(load))  # eq. (14a, c)
 
+    def constraint_matrix(self, z: Increment, problem: StepProblem) -> ConstraintMatrix:
+        return problem.constraint_matrix(z)
+
+    def chord(
+        self, rows: Increment, problem: StepProblem, constraints: ConstraintMatrix
+    ) -> Increment:
+        return step_chord(rows, constraints)
+
     def finish(self, z: Increment, problem: StepProblem) -> StepEnd:
-        end = self._end(z, problem).state
+        end = self._end(z, problem)
         work, drive_work = (
             problem.step_work(end, z),
             problem.drive_work(problem.start, end, z),
@@ -77,7 +84,7 @@ class EnergyPreserving(AbstractOneSolveScheme[Increment, StepProblem]):
             energies=problem.account(jnp.zeros_like(problem.h), work, drive_work),
         )
 
-    def _end(self, z: Increment, problem: StepProblem) -> Node:
+    def _end(self, z: Increment, problem: StepProblem) -> State:
         start, q1, t1 = problem.start, problem.position(z), problem.end_time
 
         def velocity(reaction: Reaction) -> tuple[Velocities]:

@@ -18,7 +18,7 @@ from ._discontinuous import (
     predict_jump_and_end,
     split_velocities,
 )
-from .base import AbstractOneSolveScheme, Formulation, Node, StepEnd, StepProblem
+from .base import AbstractOneSolveScheme, Formulation, StepEnd, StepProblem
 
 
 class _Unknowns(eqx.Module):
@@ -87,8 +87,7 @@ class KappaDecaying(AbstractOneSolveScheme[_Unknowns, StepProblem]):
     def residual(self, z: _Unknowns, problem: StepProblem) -> _Unknowns:
         model, start, h = problem.model, problem.start, problem.h
         nodes, kappa = z.nodes, _kappa(z)
-        jump_node, end_node = self._nodes(z, problem)
-        jump, end = jump_node.state, end_node.state
+        jump, end = self._nodes(z, problem)
         loads = jump_loads(self.alpha, nodes, problem, jump, end)
         after = problem.discrete_gradient(jump, end, _position_level(nodes.end))
         before = problem.discrete_gradient(start, jump, _position_level(nodes.jump))
@@ -109,14 +108,14 @@ class KappaDecaying(AbstractOneSolveScheme[_Unknowns, StepProblem]):
         )
         return _Unknowns(
             nodes=JumpAndEnd(
-                jump=problem.rows(nodes.jump, jump_node, to_jump),  # eq. (66b)
-                end=problem.rows(nodes.end, end_node, to_end),  # eq. (66a)
+                jump=problem.rows(nodes.jump, jump, to_jump),  # eq. (66b)
+                end=problem.rows(nodes.end, end, to_end),  # eq. (66a)
             ),
             kappa=self._kappa_row(z, problem, jump, end, after, before),
         )
 
     def finish(self, z: _Unknowns, problem: StepProblem) -> StepEnd:
-        jump, end = (node.state for node in self._nodes(z, problem))
+        jump, end = self._nodes(z, problem)
         kinetic, potential = jump_energy(problem, jump)
         kappa = _kappa(z)
         dissipated = self.alpha.astype(kappa.dtype) * (kappa * kinetic + potential)
@@ -158,7 +157,7 @@ class KappaDecaying(AbstractOneSolveScheme[_Unknowns, StepProblem]):
         scale = model.energy_scale(start, problem.h)
         return ((z.kappa - 1) * change + 0.5 * work) / scale
 
-    def _nodes(self, z: _Unknowns, problem: StepProblem) -> tuple[Node, ...]:
+    def _nodes(self, z: _Unknowns, problem: StepProblem) -> tuple[State, ...]:
         """The nodes after the jump, which takes no time, and at the end."""
         model, start, kappa = problem.model, problem.start, _kappa(z)
         jump, end = z.nodes.jump, z.nodes.end

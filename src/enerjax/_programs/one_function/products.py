@@ -37,6 +37,14 @@ def written_out(left: Array, right: Array, dimension_numbers: Any) -> Array:
     return out.reshape(shape)
 
 
+def summed(x: Array, axes: int = 1) -> Array:
+    """The sum over the last axes, which stays possible in one function where it is long."""
+    flat = x.reshape(*x.shape[: x.ndim - axes], -1)
+    if flat.size <= LARGEST_SUM or flat.shape[-1] > 2 * _MAX_TERMS:
+        return jnp.sum(flat, axis=-1)
+    return functools.reduce(jnp.add, (flat[..., k] for k in range(flat.shape[-1])))
+
+
 def _as_rows(
     x: Array, contracted: tuple[int, ...], batch: tuple[int, ...]
 ) -> tuple[Array, tuple[int, ...]]:

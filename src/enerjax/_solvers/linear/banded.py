@@ -41,7 +41,7 @@ class Band:
         size, _ = shape_of(pattern)
         both = (pattern + pattern.T).tocsr()
         order = reverse_cuthill_mckee(both, symmetric_mode=True)
-        sizes = _block_sizes(both[order][:, order])
+        sizes = block_sizes(both[order][:, order])
         self.width = width = int(sizes.max(initial=1))
         self.num_blocks = blocks = sizes.size
         self.size = size
@@ -86,7 +86,7 @@ class Band:
         return entries[self.places] + jnp.asarray(self.filling, x.dtype)
 
 
-def _block_sizes(pattern: csr_array) -> np.ndarray:
+def block_sizes(pattern: csr_array) -> np.ndarray:
     """Sizes of blocks along a symmetric band, such that only neighbours touch.
 
     From that of the first one follow all others, at their smallest; together, up to the

@@ -11,12 +11,12 @@ from jaxtyping import Array, Float
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from ..._programs import Indices, is_known, jacobian_pattern
+from ..._programs import Indices, is_known, jacobian_pattern, summed
 
 
 # Rows of the largest block that counts as small, and of a matrix that is not worth it.
 _BLOCK = 16
-_FEW = 24
+_FEW = 8
 
 
 class Places(Indices):
@@ -60,7 +60,7 @@ class BlockDiagonal(eqx.Module):
 
     def __matmul__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         parts = jnp.append(x, 0)[self.places.rows]
-        return jnp.sum(self.blocks * parts[:, None, :], axis=-1).ravel()[self.places.back]
+        return summed(self.blocks * parts[:, None, :]).ravel()[self.places.back]
 
     def __rmatmul__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         return self @ x  # symmetric

@@ -48,7 +48,7 @@ class Full:
 
     def empty(self, size: int, dtype: Any) -> AbstractFactors:
         if self.solver is None:
-            return LU.empty(size, dtype)
+            return (Inverse if size <= SMALL else LU).empty(size, dtype)
         return LineaxFactors(self.solver, jnp.zeros((size, size), dtype))
 
 
@@ -63,19 +63,11 @@ class Linearisable(eqx.Module):
     form: Full | Band | Scattered
     # Added to the diagonal of a Jacobian that may be singular.
     regularisation: Float[Array, " n"] | None
-    # A function whose Jacobian approximates that of `value`, where a search is to be done
-    # with it.
-    jacobian_of: Callable[[Float[Array, " n"]], Float[Array, " n"]] | None = None
 
     @property
     def is_dense(self) -> bool:
         """Whether its Jacobian is dense, and solved with as this package sees fit."""
         return isinstance(self.form, Full) and self.form.solver is None
-
-    @property
-    def is_exact(self) -> bool:
-        """Whether `jacobian` is that of `value`."""
-        return self.jacobian_of is None
 
     @property
     def keeps_factors(self) -> bool:
@@ -85,7 +77,7 @@ class Linearisable(eqx.Module):
     def jacobian(self, x: Float[Array, " n"]) -> Array:
         """The Jacobian, in the form that `first_factors` are renewed with."""
         regularisation = self.regularisation
-        value = self.value if self.jacobian_of is None else self.jacobian_of
+        value = self.value
         if regularisation is None:
             return self.form.evaluate(value, x)
         return self.form.evaluate(lambda x: value(x) + regularisation * x, x)
@@ -201,29 +193,6 @@ def affine_root(
     if linear.is_dense and regularisation is None:
         return -jnp.linalg.solve(linear.jacobian(at), linear.value(at))
     return -linear.solve(at, linear.value(at))
-
-
-def narrowed(
-    exact: Linearisable,
-    jacobian_of: Callable[[Array, PyTree], Array],
-    like: Float[Array, " n"],
-    args: Any,
-) -> Linearisable | None:
-    """The same function with the Jacobian of `jacobian_of(x, args)` in place of its own.
-
-    `None` where that is no narrower band, because then nothing is gained.
-    """
-    narrow = linearisable(jacobian_of, like, args, regularisation=exact.regularisation)
-    if not isinstance(narrow.form, Band):
-        return None
-    if isinstance(exact.form, Band) and narrow.form.width >= exact.form.width:
-        return None
-    return Linearisable(
-        value=exact.value,
-        form=narrow.form,
-        regularisation=exact.regularisation,
-        jacobian_of=narrow.value,
-    )
 
 
 class RowPattern:

@@ -1,0 +1,197 @@
+"""Chord iterations with inertia and constraints, and Newton's method where they fail."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+import enerjax as ej
+from enerjax._operators import SeparableModel
+from enerjax._solvers import Chord, find_root, Newton, schur, schur_tables
+from enerjax._solvers.linear.blocks import in_blocks
+
+from .helpers import EPS, SCHEMES
+
+
+SIZE = 30
+
+# The matrix of the multipliers ------------------------------------------------------------
+
+# Pairs of three-dimensional bodies that are joined by two rows each; -1 is the ground.
+GRAPHS = {
+    "one": [(-1, 0)],
+    "chain": [(k - 1, k) for k in range(12)],
+    "tree": [((k - 1) // 2, k) for k in range(1, 12)] + [(-1, 0)],
+    "loops": [(k - 1, k) for k in range(9)] + [(8, -1), (2, 6)],
+}
+
+
+@pytest.mark.parametrize("coupled", [False, True])
+@pytest.mark.parametrize("graph", GRAPHS)
+def test_the_matrix_of_the_multipliers_is_that_of_dense_algebra(graph, coupled):
+    joints = np.array(GRAPHS[graph])
+    count = joints.max() + 1
+    rng = np.random.default_rng(0)
+    a, b = (jnp.asarray(rng.normal(size=(len(joints), 2, 3))) for _ in range(2))
+
+    def rows(u):
+        bodies = jnp.concatenate([u.reshape(count, 3), jnp.zeros((1, 3))])
+        ends = [bodies[joints[:, k]][:, None] for k in (0, 1)]
+        return jnp.sum(a * ends[0] + b * ends[1], axis=2).ravel()
+
+    root = rng.normal(size=(3, 3))
+    weight = np.kron(np.eye(count), root @ root.T + np.eye(3))
+    if coupled:
+        weight = weight + 0.1
+    at = jnp.asarray(rng.normal(size=3 * count))
+    symmetric = in_blocks(jnp.asarray(weight))
+    tables = schur_tables(rows, at, symmetric)
+    assert tables is not None
+    found = schur(tables, rows, at, symmetric)
+    jacobian = np.asarray(jax.jacfwd(rows)(at))
+    matrix = jacobian @ weight @ jacobian.T
+    u, x = rng.normal(size=3 * count), rng.normal(size=(2, 2 * len(joints)))
+    np.testing.assert_allclose(found.product(u), jacobian @ u, atol=100 * EPS)
+    np.testing.assert_allclose(found.transposed(x[0]), jacobian.T @ x[0], atol=100 * EPS)
+    # Round-off, by the condition of the matrix.
+    atol = 10 * EPS * np.linalg.cond(matrix) * np.linalg.norm(np.linalg.inv(matrix), 2)
+    np.testing.assert_allclose(
+        found.solve(jnp.asarray(x)), np.linalg.solve(matrix, x.T).T, rtol=0, atol=atol
+    )
+
+
+# The corrections of the schemes -----------------------------------------------------------
+
+CHORDS = {
+    "preserving": ej.EnergyPreserving(),
+    "preserving index3": ej.EnergyPreserving("index3"),
+    "decaying 0": ej.EnergyDecaying(0.0),
+    "decaying": ej.EnergyDecaying(0.4),
+    "decaying index3": ej.EnergyDecaying(0.4, "index3"),
+    "consistent 0": ej.EnergyConsistent(0.0),
+    "consistent": ej.EnergyConsistent(0.6),
+}
+
+
+@pytest.mark.parametrize("name", CHORDS)
+@pytest.mark.parametrize("size", [4, 80])
+def test_without_stiffness_one_correction_solves_the_step(name, size):
+    """With a weight for a potential and constant gradients of the constraints."""
+    rng = np.random.default_rng(0)
+    count = size // 4
+    rows = jnp.asarray(rng.normal(size=(count, 4)))
+    mass = jnp.asarray(rng.uniform(0.5, 2, size=size))
+    system = ej.System(
+        jnp.diag(mass),
+        lambda q, args: 9.81 * jnp.sum(q),
+        lambda q, args: jnp.sum(rows * q.reshape(count, 4), axis=1),
+    )
+    scheme = CHORDS[name]
+    start = ej.initial_state(system, rng.normal(size=size), rng.normal(size=size))
+    assert isinstance(system, ej.System)
+    model = SeparableModel(system, start, None)
+    problem = scheme.problem(model, start, jnp.asarray(0.1))
+    z = scheme.predict(problem, jnp.zeros(size), jnp.zeros(count))
+    flat, unravel = ravel_pytree(z)
+    flat = flat + jnp.asarray(rng.normal(size=flat.size))
+
+    @jax.jit
+    def corrected(flat):
+        residual = scheme.residual(unravel(flat), problem)
+        matrix = scheme.constraint_matrix(unravel(flat), problem)
+        correction = scheme.chord(residual, problem, matrix)
+        left = scheme.residual(
+            jax.tree.map(jnp.subtract, unravel(flat), correction), problem
+        )
+        return ravel_pytree(residual)[0], ravel_pytree(left)[0]
+
+    before, left = corrected(flat)
+    assert jnp.max(jnp.abs(before)) > 0.1
+    assert jnp.max(jnp.abs(left)) <= 1e4 * EPS  # round-off
+
+
+# The search -------------------------------------------------------------------------------
+
+ARGS = jnp.cos(jnp.arange(float(SIZE)))
+
+
+def _equations(x, inputs):
+    strength, args = inputs
+    return 2 * x + strength * jnp.arctan(jnp.roll(x, 9)) - args
+
+
+CHORD = Chord(lambda x, inputs: None, lambda value, inputs, _: 0.5 * value)
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def _root(strength, args, guess, chord=CHORD):
+    inputs = strength, args
+    return find_root(_equations, Newton(), guess, inputs, max_iterations=50, chord=chord)
+
+
+@pytest.mark.parametrize(("strength", "by_chord"), [(1e-3, True), (0.1, True), (30, False)])
+def test_a_root_and_its_derivatives_do_not_depend_on_the_chord(strength, by_chord):
+    """Neither where the chord iteration is quick, nor where Newton's method must follow."""
+    guess = jnp.zeros(SIZE)
+    root = _root(strength, ARGS, guess)
+    assert root.found
+    assert root.by_chord == by_chord
+    rest = _equations(root.value, (strength, ARGS))
+    assert jnp.max(jnp.abs(rest)) <= 100 * (1 + strength) * EPS  # round-off
+    found, change = jax.jvp(lambda a: _root(strength, a, guess).value, (ARGS,), (ARGS,))
+    jacobian = jax.jacfwd(_equations)(found, (strength, ARGS))
+    np.testing.assert_allclose(change, np.linalg.solve(jacobian, ARGS), rtol=1e-9)
+
+
+def test_lanes_that_need_newton_do_not_affect_others():
+    strengths = jnp.array([1e-3, 30.0])
+    lanes = jax.vmap(lambda s: _root(s, ARGS, jnp.zeros(SIZE)))(strengths)
+    assert lanes.by_chord.tolist() == [True, False]
+    for k, strength in enumerate(strengths):
+        alone = _root(strength, ARGS, jnp.zeros(SIZE))
+        np.testing.assert_allclose(lanes.value[k], alone.value, rtol=1e-12)  # solver
+        assert lanes.iterations[k] == alone.iterations
+
+
+@pytest.mark.parametrize("off", [1e-3, 1e-7])
+def test_slow_corrections_are_not_taken_for_round_off(off):
+    """Each leaves a good third of the one before."""
+    noise = jnp.asarray(np.random.default_rng(0).normal(size=SIZE))
+    at = _root(0.8, ARGS, jnp.zeros(SIZE)).value
+    found = _root(0.8, ARGS, at + off * noise)
+    assert found.found
+    rest = _equations(found.value, (0.8, ARGS))
+    assert jnp.max(jnp.abs(rest)) <= 100 * EPS  # round-off
+
+
+@pytest.mark.parametrize("name", ["preserving", "decaying", "consistent"])
+def test_the_motion_is_that_of_newton_alone(name):
+    """A given linear solver is used by Newton's method, without a chord iteration."""
+    system, start, args = ej.problems.chain(3)
+    run = lambda finder: ej.simulate(
+        system, SCHEMES[name](0.5), start, args, h=4e-3, num_steps=50, root_finder=finder
+    )
+    runs = run(Newton()), run(Newton(linear_solver=lx.LU()))
+    # Solver: round-off of fifty steps.
+    np.testing.assert_allclose(runs[0].ys.q, runs[1].ys.q, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(runs[0].ys.v, runs[1].ys.v, rtol=0, atol=1e-11)
+
+
+def test_newton_follows_where_springs_are_too_stiff_for_the_chord():
+    """Two points on rods, held by springs of a hundred radians a step."""
+    system = ej.System(
+        jnp.eye(4),
+        lambda q, args: 0.5 * args * (q[1] ** 2 + (q[3] - q[1]) ** 2),
+        lambda q, args: jnp.array([q[:2] @ q[:2] - 1, jnp.sum((q[2:] - q[:2]) ** 2) - 1]),
+    )
+    stiffness = (100 / 0.01) ** 2
+    start = ej.initial_state(
+        system, [1.0, 0.0, 2.0, 0.0], [0.0, 1.0, 0.0, 0.5], args=stiffness
+    )
+    sol = ej.simulate(system, ej.EnergyPreserving(), start, stiffness, h=0.01, num_steps=60)
+    energy = sol.audit.energy
+    assert jnp.ptp(energy) <= 60 * 100 * EPS * energy[0]  # round-off
