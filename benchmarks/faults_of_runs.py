@@ -16,9 +16,9 @@ FAULTS = (
     Fault(
         "band: colours of a dense matrix",
         "_solvers/linear/jacobian.py",
-        "        return jnp.where(self._filled, columns, 0)\n",
+        "        return jnp.where(self._nonzero, columns, 0)\n",
         "        return columns\n",
-        "Full Jacobians whose columns are found together have entries of other columns.",
+        "Dense Jacobians whose columns are found together have entries of other columns.",
         of("elements::test_a_net_with_loops"),
     ),
     Fault(
@@ -38,19 +38,19 @@ FAULTS = (
         of("parts::test_derivatives_of_solutions"),
     ),
     Fault(
-        "regularisation: an open part that stands still",
+        "regularisation: a null space that stands still",
         "_solvers/root.py",
-        "change + _turned(linear, flat_fn, flat, (moved, fixed), t_args)",
+        "change + _null_space_rate(linear, flat_fn, flat, (moved, fixed), t_args)",
         "change",
-        "Derivatives of multipliers of least norm miss how their null space turns.",
+        "Derivatives of multipliers of least norm miss how their null space rotates.",
         of("redundant::test_derivatives_of_forces_that_turn_against_each_other"),
     ),
     Fault(
         "root: derivative at the guess",
         "_solvers/root.py",
-        "    _, rate = jax.jvp(by_args, (moved,), (t_args,))\n    given",
+        "    _, rate = jax.jvp(by_args, (moved,), (t_args,))\n    linear_solver",
         "    _, rate = jax.jvp(by_args, (moved,), (t_args,))\n"
-        "    flat = ravel_pytree(start.guess)[0]\n    given",
+        "    flat = ravel_pytree(start.guess)[0]\n    linear_solver",
         "Derivatives of a root solve with the Jacobian at the first guess.",
         of(
             "gradients::test_derivatives_of_a_free_oscillator",

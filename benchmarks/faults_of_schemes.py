@@ -182,8 +182,8 @@ FAULTS = (
     Fault(
         "decaying: the velocity of a damper in the jump",
         "schemes/_discontinuous.py",
-        "3 * lag - half * (vj - v0)",
-        "3 * lag",
+        "3 * jump_rate - half * (vj - v0)",
+        "3 * jump_rate",
         "The velocity over the jump misses a term, so that the work of a damper is no sum "
         "of squares.",
         of("forces::test_the_work_of_a_damper_in_a_decaying_step_is_a_sum_of_squares"),

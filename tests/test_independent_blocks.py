@@ -11,10 +11,10 @@ from enerjax._operators import make_model, SeparableModel
 from enerjax._programs import jacobian_pattern
 from enerjax._solvers import (
     constant_entries,
+    independent_blocks,
     inverse,
-    multiply_parts,
-    parts_of,
-    solve_parts,
+    multiply_by_blocks,
+    solve_by_blocks,
 )
 from enerjax._system.kinematics import ConfigurationKinematics
 
@@ -35,26 +35,26 @@ def block_matrix(ones=2):
 
 
 MATRIX = block_matrix()
-PARTS = parts_of(np.where((MATRIX == 0) | (MATRIX == 1), MATRIX, np.nan))
+BLOCKS = independent_blocks(np.where((MATRIX == 0) | (MATRIX == 1), MATRIX, np.nan))
 RIGHT = RNG.normal(size=8)
 
 
 def test_blocks_are_found():
-    assert PARTS is not None
-    shapes = [(kind, rows.shape) for kind, rows, _ in PARTS.groups]
+    assert BLOCKS is not None
+    shapes = [(kind, rows.shape) for kind, rows, _ in BLOCKS.groups]
     assert shapes == [(0, (2, 1)), (1, (1, 1)), (2, (1, 2)), (3, (1, 3))]
 
 
 def test_solutions_are_those_of_the_whole_matrix():
-    x = solve_parts(PARTS, jnp.asarray(MATRIX), jnp.asarray(RIGHT))
+    x = solve_by_blocks(BLOCKS, jnp.asarray(MATRIX), jnp.asarray(RIGHT))
     # Round-off, times the condition of the blocks.
     error = np.max(np.abs(x - np.linalg.solve(MATRIX, RIGHT)))
     assert error <= 1e-15 * np.linalg.cond(MATRIX) * np.max(np.abs(x))
 
 
 def test_products_are_those_of_the_whole_matrix():
-    assert PARTS is not None
-    product = multiply_parts(PARTS, jnp.asarray(MATRIX), jnp.asarray(RIGHT))
+    assert BLOCKS is not None
+    product = multiply_by_blocks(BLOCKS, jnp.asarray(MATRIX), jnp.asarray(RIGHT))
     # Round-off of three terms of order one.
     np.testing.assert_allclose(product, MATRIX @ RIGHT, rtol=0, atol=4e-15)
 
@@ -62,10 +62,12 @@ def test_products_are_those_of_the_whole_matrix():
 def test_derivatives_of_solutions():
     change = np.where(MATRIX == 0, 0, RNG.normal(size=(8, 8)))
     change = np.where(MATRIX == 1, 0, change)
-    solution = lambda parts: lambda s: solve_parts(parts, MATRIX + s * change, RIGHT + s)
-    of_parts, of_whole = solution(PARTS), solution(None)
+    solution = lambda blocks: (
+        lambda s: solve_by_blocks(blocks, MATRIX + s * change, RIGHT + s)
+    )
+    of_blocks, of_whole = solution(BLOCKS), solution(None)
     for derivative in (jax.jacfwd, jax.jacrev, lambda f: jax.jacfwd(jax.jacrev(f))):
-        a, b = derivative(of_parts)(0.0), derivative(of_whole)(0.0)
+        a, b = derivative(of_blocks)(0.0), derivative(of_whole)(0.0)
         # Round-off, times the square of the condition.
         assert np.max(np.abs(a - b)) <= 1e-15 * np.linalg.cond(MATRIX) ** 2 * np.max(
             np.abs(b)
@@ -73,8 +75,9 @@ def test_derivatives_of_solutions():
 
 
 def test_a_connected_or_singular_matrix_has_no_blocks():
-    assert parts_of(np.full((3, 3), np.nan)) is None
-    assert parts_of(np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])) is None
+    assert independent_blocks(np.full((3, 3), np.nan)) is None
+    singular = np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])
+    assert independent_blocks(singular) is None
 
 
 def test_zeros_at_one_point_only_are_not_constant():
@@ -102,7 +105,7 @@ def test_a_body_in_euler_parameters_has_blocks_for_position_and_rotation(jit):
         model = make_model(system, start, args)
         assert isinstance(model, SeparableModel)
         assert isinstance(model.kinematics, ConfigurationKinematics)
-        found.append(model.kinematics.parts)
+        found.append(model.kinematics.blocks)
         return start.q
 
     (jax.jit(look) if jit else look)(start, args)

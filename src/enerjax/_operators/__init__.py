@@ -14,7 +14,7 @@ from .separable import SeparableModel as SeparableModel
 
 
 def make_model(system: AbstractSystem, state: State, args: Args) -> AbstractModel:
-    """The model of a system; `state`, as the user has it, sets the scales."""
+    """The model of a system. The scales are those at `state`, which is a user's state."""
     if isinstance(system, AbstractCanonicalSystem):
         return CanonicalModel(system, state, args)
     assert isinstance(system, System)

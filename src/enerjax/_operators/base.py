@@ -1,23 +1,23 @@
-"""A system with its `args` bound: the operators of which every scheme consists.
+"""The discrete operators of a system, from which every scheme is composed.
 
-The structure residual of an interval `a -> b` with a gradient `w` is
+The residual of the equations of motion over an interval `a -> b`, with a gradient `w`, is
 
     S_q  = Lm^T (mu_b - mu_a) + G(q_m, mu_m) (q_b - q_a) + h w_q
     S_mu = Lm (q_b - q_a) - h w_mu
 
 at `q_m = (q_a + q_b)/2`, `mu_m = (mu_a + mu_b)/2`. One `L` and one skew `G` serve the whole
-interval, so that both rows together give the energy identity. `w` is the discrete gradient
-of
+interval, so that the two rows together imply the energy identity. `w` is the discrete
+gradient of
 
     H + lambda . Phi(q) + eta . psi(q, mu),      psi = dPhi/dt
 
-Forces `f` add `-h Lm^T f` to the first row. Where constraints are driven, `Phi(q, t)`,
-their part of the discrete gradient is taken over `q` and `t` together, and its entry for
-`t` is the power that they supply.
+Forces `f` add `-h Lm^T f` to the first row. For driven constraints, `Phi(q, t)`, the
+discrete gradient is taken with respect to `q` and `t` jointly, and its `t` component is the
+power that they supply.
 
-Two kinds of model implement this. In a `SeparableModel` the inertia is constant, and the
-velocities follow from `S_mu` in closed form. A `CanonicalModel` takes any Hamiltonian, and
-momenta are unknowns.
+There are two models. A `SeparableModel` has constant inertia, and its velocities follow
+from `S_mu` in closed form. A `CanonicalModel` has an arbitrary Hamiltonian, and its momenta
+are unknowns of the step.
 """
 
 import abc
@@ -38,15 +38,15 @@ from .constraint_matrix import ConstraintMatrix
 from .interval import Gradient, Increment, Scales, Time, time_rate
 
 
-# `M^-1 C(q, t)^T eta`: what velocity-level multipliers add to a velocity.
+# The function for `M^-1 C(q, t)^T eta`, the velocity that velocity-level multipliers add.
 Reaction: TypeAlias = Callable[[Coordinates, Time, JointMultipliers], Velocities]
 
 
 class AbstractModel(eqx.Module):
-    """The functions of a system at fixed `args`, and those derived from them.
+    """The functions of a system for fixed `args`, and the operators derived from them.
 
-    In the states of a model, `v` are velocities where the inertia is constant, and momenta
-    `p` where the system has a Hamiltonian.
+    The field `v` of a model's state contains velocities where the inertia is constant, and
+    the momenta `p` where the system has a Hamiltonian.
     """
 
     system: eqx.AbstractVar[AbstractSystem]
@@ -61,20 +61,20 @@ class AbstractModel(eqx.Module):
     @property
     @abc.abstractmethod
     def has_constraint_matrix(self) -> bool:
-        """Whether a chord iteration with `B M^-1 B^T` can solve the step equations."""
+        """Whether the chord method can be used, so that `constraint_matrix` exists."""
 
     @property
     @abc.abstractmethod
     def has_canonical_rates(self) -> bool:
-        """Whether `L = I`: velocities are the rates of the coordinates, or `v` is `p`."""
+        """Whether `L = I`: the velocities, or `dH/dp`, are the rates of the coordinates."""
 
     @abc.abstractmethod
     def to_internal(self, state: State) -> State:
-        """A user's state, `(q, v)`, as a state of the model."""
+        """The state of the model that corresponds to a user's state `(q, v)`."""
 
     @abc.abstractmethod
     def to_user(self, state: State) -> State:
-        """A state of the model as a user's state, without its time."""
+        """The user's state `(q, v)` that corresponds to a state of the model; no time."""
 
     @abc.abstractmethod
     def kinetic(self, state: State) -> Scalar:
@@ -90,7 +90,7 @@ class AbstractModel(eqx.Module):
 
     @abc.abstractmethod
     def gradient(self, state: State, h: Scalar) -> Gradient:
-        """`h dH/dq` and `dH/dmu` in one state, without multipliers."""
+        """`h dH/dq` and `dH/dmu` at a state, without multipliers."""
 
     @abc.abstractmethod
     def discrete_gradient(
@@ -107,7 +107,7 @@ class AbstractModel(eqx.Module):
     def structure(
         self, a: State, b: State, h: Scalar, rate: Coordinates, gradient: Gradient
     ) -> tuple[Coordinates, Float[Array, " np"]]:
-        """`S_q` and `S_mu/h`; `rate` is `(q_b - q_a)/h`, exact."""
+        """`S_q` and `S_mu/h`; `rate` is `(q_b - q_a)/h` without cancellation errors."""
 
     @abc.abstractmethod
     def node_momenta(
@@ -115,16 +115,16 @@ class AbstractModel(eqx.Module):
         unknowns: tuple[Float[Array, " np"], ...],
         velocities: Callable[[Reaction], tuple[Velocities, ...]],
     ) -> tuple[Velocities, ...]:
-        """What the states at the nodes of a step hold as `v`.
+        """The field `v` of the states at the nodes of a step.
 
-        With constant inertia the velocities, which `velocities` finds from the rows `S_mu`
-        given the reaction `M^-1 C^T eta`; with a Hamiltonian the momenta, which are among
-        the unknowns.
+        With constant inertia these are the velocities. `velocities` computes them from the
+        rows `S_mu`, and its argument is the function for `M^-1 C^T eta`. With a Hamiltonian
+        these are the momenta, which are the `unknowns`.
         """
 
     @abc.abstractmethod
     def momentum_rows(self, rates: Velocities) -> Float[Array, " np"]:
-        """The given entries where momenta are unknowns; else none, of shape `(0,)`."""
+        """`rates` itself where momenta are unknowns, else an array of shape `(0,)`."""
 
     @abc.abstractmethod
     def slope(self, state: State) -> Coordinates:
@@ -132,13 +132,13 @@ class AbstractModel(eqx.Module):
 
     @abc.abstractmethod
     def velocity(self, state: State) -> Velocities:
-        """The velocities that forces are conjugate to: `L qdot` or `dH/dp`."""
+        """The velocities whose product with the forces is power: `L qdot` or `dH/dp`."""
 
     @abc.abstractmethod
     def velocity_change(
         self, change: Velocities, inverse_inertia: Float[Array, "nq nq"] | Symmetric
     ) -> Velocities:
-        """The change of velocity of a change of `State.v`, with the given inertia."""
+        """The change of the velocities that corresponds to a change of `State.v`."""
 
     @abc.abstractmethod
     def kinetic_change(self, a: State, b: State, gradient: Gradient) -> Scalar:
@@ -158,7 +158,7 @@ class AbstractModel(eqx.Module):
 
     @abc.abstractmethod
     def reaction_row(self, state: State, eta: JointMultipliers) -> Float[Array, " np"]:
-        """`dpsi/dmu^T eta` as a part of the row `S_mu`; empty with constant inertia."""
+        """The term `dpsi/dmu^T eta` of the row `S_mu`; empty with constant inertia."""
 
     @abc.abstractmethod
     def lift(self, q: Coordinates, v: Velocities) -> Coordinates:
@@ -166,25 +166,25 @@ class AbstractModel(eqx.Module):
 
     @abc.abstractmethod
     def metric(self, state: State) -> Symmetric:
-        """The inertia in the coordinates, regular."""
+        """A regular inertia matrix for the rates of the coordinates."""
 
     @abc.abstractmethod
     def inverse_metric(self, state: State) -> Symmetric:
-        """The inverse of the matrix that changes of `State.v` are measured in.
+        """The inverse of the metric of `State.v`.
 
-        `M^-1` for velocities. Momenta are measured in the inverse of the inertia, so for
-        them it is the inertia.
+        The metric of velocities is the inertia `M`, so this is `M^-1`. The metric of
+        momenta is `M^-1`, so this is `M`.
         """
 
     @abc.abstractmethod
     def stiffness(
         self, state: State, multipliers: Multipliers
     ) -> tuple[Float[Array, "nq nq"] | Assembled, Symmetric]:
-        """`K = Hess_q (H + lambda . Phi)`, by elements if it can be, and the inertia."""
+        """`K = Hess_q (H + lambda . Phi)`, assembled if possible, and the inertia."""
 
     @abc.abstractmethod
     def augmented_energy(self, state: State, multipliers: Multipliers) -> Scalar:
-        """`H + lambda . Phi(q, t)`, without a kinetic energy that `q` does not enter."""
+        """`H + lambda . Phi(q, t)`; with constant inertia without the kinetic energy."""
 
     @abc.abstractmethod
     def skew_gradient(
@@ -194,16 +194,17 @@ class AbstractModel(eqx.Module):
         change: tuple[Coordinates, Velocities, Time],
         h: Scalar,
     ) -> Gradient:
-        """`D J D (z1 - z0)`, the first part times `h`; `D = Hess(H + lambda . Phi)`.
+        """`D J D (z1 - z0)` with `D = Hess(H + lambda . Phi)`.
 
-        `change` is `z1 - z0` as `(q, v, t)`. The result is orthogonal to it, so it does no
-        work. Time counts as a coordinate whose momentum nothing depends on. With constant
-        inertia the second part is empty; `stiffness_product` gives it.
+        The rows of the coordinates are multiplied by `h`. `change` is `z1 - z0` as
+        `(q, v, t)`. The result is orthogonal to `z1 - z0`, so it does no work. Time is
+        treated as a coordinate whose momentum does not enter the Hamiltonian. With constant
+        inertia the rows of the momenta are empty; `stiffness_product` gives them.
         """
 
     @abc.abstractmethod
     def constraint_matrix(self, q: Coordinates, t: Time) -> ConstraintMatrix:
-        """`B M^-1 B^T` at a position, where `has_constraint_matrix`."""
+        """`B M^-1 B^T` at a position. It exists only if `has_constraint_matrix`."""
 
     @abc.abstractmethod
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
@@ -215,12 +216,12 @@ class AbstractModel(eqx.Module):
 
     @abc.abstractmethod
     def constraint(self, q: Coordinates, t: Time) -> Multipliers:
-        """`Phi(q, t)`: joints first, then coordinate constraints."""
+        """`Phi(q, t)`: the joints, followed by the coordinate constraints."""
 
     def stiffness_product(
         self, state: State, multipliers: Multipliers, along: tuple[Coordinates, Time]
     ) -> tuple[Coordinates, Time]:
-        """`K` times a vector in coordinates and time, with its row and column of time."""
+        """`K`, extended by a row and a column for the time, times a vector `(q, t)`."""
         energy = lambda q, t: self.augmented_energy(State(q, state.v, t), multipliers)
         gradient = jax.grad(energy, argnums=(0, 1))
         return jax.jvp(gradient, (state.q, state.t), along)[1]
@@ -233,20 +234,20 @@ class AbstractModel(eqx.Module):
         return transpose(multipliers)[0]
 
     def fixed(self, q: Coordinates) -> Float[Array, " nf"]:
-        """The joints that do not depend on time."""
+        """The scleronomic joints, which do not depend on time."""
         if self.system.constraint is None:
             return jnp.zeros((0,), q.dtype)
         return self.system.constraint(q, self.args)
 
     def driven(self, q: Coordinates, t: Time) -> Float[Array, " nd"]:
-        """The driven constraints, which depend on time."""
+        """The driven (rheonomic) constraints, which depend on time."""
         if self.system.driven is None:
             return jnp.zeros((0,), q.dtype)
         assert t is not None
         return self.system.driven(q, t, self.args)
 
     def joint(self, q: Coordinates, t: Time) -> JointMultipliers:
-        """The constraints that are imposed at velocity level too: fixed, then driven."""
+        """The constraints that can be imposed at velocity level: fixed, then driven."""
         if self.system.driven is None:
             return self.fixed(q)
         return jnp.concatenate([self.fixed(q), self.driven(q, t)])
@@ -256,14 +257,14 @@ class AbstractModel(eqx.Module):
         return jax.jvp(self.joint, (q, t), (self.lift(q, v), time_rate(t)))[1]
 
     def symmetry_momenta(self, state: State) -> Float[Array, " ns"]:
-        """The momenta of the symmetries that the user has named."""
+        """The momentum maps of the symmetries that the user has declared."""
         symmetry = self.system.symmetry
         none = jnp.zeros((0,), state.q.dtype)
         return symmetry(state.q, self.args) @ self.momentum(state) if symmetry else none
 
     def split(self, increment: Increment) -> tuple[Increment, Increment]:
-        """The increment with the multipliers of the constraints that do not depend on time,
-        and with those of the driven constraints."""
+        """Two increments: one with the multipliers of the time-independent constraints
+        only, and one with those of the driven constraints only."""
         if self.system.driven is None:
             return increment, increment
         q, t = increment.rate, jnp.zeros((), increment.rate.dtype)
@@ -295,29 +296,30 @@ class AbstractModel(eqx.Module):
         return self.system.force(q, v, t, self.args)
 
     def damping(self, q: Coordinates, v: Velocities, t: Time) -> Velocities:
-        """The part of `f` that changes sign with the velocity."""
+        """The part of `f` that is odd in the velocity."""
         return 0.5 * (self.force(q, v, t) - self.force(q, -v, t))
 
     def regularisation(self, count: int, dtype: Any) -> Float[Array, " count"] | None:
-        """What makes equations for `count` scaled multipliers regular.
+        """The regularisation of equations for `count` scaled multipliers.
 
-        Small numbers for the diagonal; `None` for a system whose constraints are declared
-        independent of each other.
+        These are small numbers that are added to the diagonal of the Jacobian. `None` for a
+        system whose constraints are declared to be independent.
         """
         if not self.system.redundant:
             return None
         return jnp.full((count,), -(float(jnp.finfo(dtype).eps) ** 0.5), dtype)
 
     def regularisation_after(self, x: Array, count: int) -> Float[Array, " n"] | None:
-        """The same for equations in `x`, which needs none, and in `count` multipliers."""
+        """The regularisation of equations for `x`, where it is zero, and multipliers."""
         numbers = self.regularisation(count, x.dtype)
         return None if numbers is None else jnp.concatenate([jnp.zeros_like(x), numbers])
 
     def energy_scale(self, state: State, h: Scalar) -> Scalar:
-        """An energy that is typical of a step of length `h`; never zero, no derivative.
+        """A typical energy of a step of length `h`; positive, with zero derivatives.
 
-        The largest of the kinetic energy, and of the kinetic energies that the forces and
-        the driven constraints, acting for `h`, would give to a body at rest.
+        It is twice the largest of three energies: the kinetic energy, and the kinetic
+        energies that bodies at rest would gain in the time `h` from the forces and from the
+        driven constraints. It is one if all three are zero.
         """
         gained = h * self.slope(state) / self.scales.coordinate
         size = jnp.maximum(2 * self.kinetic(state), gained @ gained)
@@ -329,10 +331,11 @@ class AbstractModel(eqx.Module):
         return jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
 
     def force_size(self, state: State) -> Coordinates:
-        """How large the terms of `dH/dq` and of the applied forces are, each coordinate.
+        """The size of the terms of `dH/dq` and of the applied forces, per coordinate.
 
-        Where springs balance each other or a weight, the forces vanish. What is computed
-        there is the round-off of their terms, the machine epsilon times this size.
+        In an equilibrium the sum of the forces is zero, but the forces of the springs and
+        the weights are not. The computed sum is then round-off: the machine epsilon times
+        this size.
         """
         return _term_size(lambda model, state: model.slope(state), self, state)
 
@@ -343,9 +346,9 @@ class AbstractModel(eqx.Module):
         h: Scalar,
         increment: Increment,
     ) -> Scalar | float:
-        """How large the terms of `h V + impulse . Phi` are, for corrected derivatives.
+        """The size of the terms of `h V + impulse . Phi`.
 
-        Other discrete derivatives do not need it, and it is zero.
+        Only discrete derivatives with a correction term use it; for others it is zero.
         """
         if not isinstance(derivative, AbstractCorrected):
             return 0.0
@@ -355,10 +358,11 @@ class AbstractModel(eqx.Module):
         return _OPERATIONS_PER_TERM * size
 
     def _scales(self, state: State) -> Scales:
-        """The scales at `q`.
+        """The scales at a state.
 
-        They are part of Newton's tests. A solution depends on them only where constraints
-        are redundant: they define the norm in which the multipliers are smallest.
+        They enter the convergence tests of Newton's method. Solutions depend on them only
+        where constraints are redundant: the scales then define the norm that the
+        multipliers minimise.
         """
         q = state.q
         coordinate = jnp.sqrt(self.metric(state).diagonal())
@@ -366,25 +370,25 @@ class AbstractModel(eqx.Module):
         pattern = RowPattern(constraint, q)
         entries, columns = pattern.derivative(constraint, q), pattern.columns
         constraint = jnp.sqrt(jnp.sum((entries / coordinate[columns]) ** 2, axis=1))
-        # A gradient that vanishes makes the step equations singular, which is reported
-        # as such; it must not turn the scaling into a division by zero.
+        # A zero gradient makes the step equations singular, which is reported as a failure.
+        # The scaling must not divide by zero before that.
         constraint = jnp.where(constraint > 0, constraint, 1.0)
         size = jnp.sum(jnp.abs(entries * q[columns]), axis=1)
         scales = Scales(coordinate, constraint, size)
         return scales if self.system.redundant else jax.lax.stop_gradient(scales)
 
 
-# Every term costs a few operations, each with a rounding error of its own.
+# The evaluation of a term takes a few operations, each with a rounding error.
 _OPERATIONS_PER_TERM = 4.0
 
 
 def _term_size(
     fn: Callable[[AbstractModel, State], Array], model: AbstractModel, state: State
 ) -> Array:
-    """How far `fn` would change if each of its inputs were wrong by its own size.
+    """The first-order change of `fn` if each input changed by its own size.
 
-    The inputs are varied by unequal parts, so that terms that cancel in `fn` do not cancel
-    here.
+    The inputs are changed by unequal fractions of their sizes, so that terms that cancel
+    in `fn` do not cancel here.
     """
     inputs, rest = eqx.partition((state.q, model.args), eqx.is_inexact_array)
     is_none = lambda x: x is None
@@ -396,9 +400,9 @@ def _term_size(
 
     inputs = jax.lax.stop_gradient(inputs)
     flat, unravel = ravel_pytree(inputs)
-    # Multiples of the golden ratio are never equal modulo one.
+    # Multiples of the golden ratio differ from each other modulo one.
     parts = 0.5 + (0.618034 * jnp.arange(1, flat.size + 1, dtype=flat.dtype)) % 1
     value, change = jax.jvp(of, (inputs,), (unravel(parts * flat),))
-    # Where `args` enter through a function without a derivative their part is unknown.
+    # The derivative can be non-finite if `fn` is not differentiable in `args`.
     size = jnp.abs(value) + jnp.where(jnp.isfinite(change), jnp.abs(change), 0)
     return jax.lax.stop_gradient(size)

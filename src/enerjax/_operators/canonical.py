@@ -1,4 +1,7 @@
-"""Any Hamiltonian `H(q, p)`, with `L = I`, `G = 0` and momenta as unknowns."""
+"""Systems with an arbitrary Hamiltonian `H(q, p)`; the momenta are unknowns of a step.
+
+In the notation of `base.py`, `L = I` and `G = 0`.
+"""
 
 from collections.abc import Callable
 
@@ -16,7 +19,7 @@ from .interval import Gradient, gradient_and_work, Increment, Scales, Time, time
 
 
 class CanonicalModel(AbstractModel):
-    """A system with a Hamiltonian at fixed `args`; in its states `v` is `p`."""
+    """A system with a Hamiltonian for fixed `args`; the `v` of its states is `p`."""
 
     system: AbstractCanonicalSystem
     args: Args
@@ -126,7 +129,7 @@ class CanonicalModel(AbstractModel):
             q = z[:size]
             return self.driven_action(q, self.lift(q, z[size:]), t, h, driven)
 
-        # Positions and momenta have a common measure only by way of a time.
+        # The metric on positions and momenta needs a time to make the units equal: `h`.
         middle = 0.5 * (a.q + b.q), 0.5 * (a.v + b.v)
         masses = self.system.masses(*middle, self.args)
         weights = jnp.concatenate([masses, h**2 / masses])
@@ -180,7 +183,7 @@ class CanonicalModel(AbstractModel):
         at = middle.q, middle.v, middle.t
         no_time = jax.tree.map(jnp.zeros_like, middle.t)
         gradient = jax.grad(action, argnums=(0, 1, 2))
-        # Each product is with `h D`, and one factor `h` is wanted in the first part only.
+        # Each product is with `h D`; the result needs a factor `h` in the rows of `q` only.
         _, (force, rate, _) = jax.jvp(gradient, at, change)
         _, (force, rate, power) = jax.jvp(gradient, at, (rate / h, -force / h, no_time))
         return Gradient(force, rate / h, power)

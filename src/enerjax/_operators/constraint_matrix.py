@@ -1,4 +1,4 @@
-"""The matrix of the multipliers, `G = B M^-1 B^T`, of the constraints of a step."""
+"""The constraint matrix `G = B M^-1 B^T` of the equations for the multipliers."""
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -11,20 +11,20 @@ class ConstraintMatrix(eqx.Module):
     """Products and solves with the gradients `B` of all constraints at one position.
 
     - `inverse_inertia`: `M^-1`.
-    - `schur`: `B`, and `G = B M^-1 B^T` eliminated.
+    - `schur`: `B`, and the factors of `G = B M^-1 B^T`.
     """
 
     inverse_inertia: Symmetric
     schur: Schur
 
     def product(self, velocity: Velocities) -> Multipliers:
-        """`B velocity`, rates of change of the constraints."""
+        """`B velocity`, the rates of change of the constraints."""
         return self.schur.product(velocity)
 
     def velocity(self, impulses: Multipliers) -> Velocities:
-        """`M^-1 B^T impulses`, what impulses of the constraints add to velocities."""
+        """`M^-1 B^T impulses`, the velocities that impulses of the constraints cause."""
         return self.inverse_inertia @ self.schur.transposed(impulses)
 
     def solve(self, right: Float[Array, "k nc"]) -> Float[Array, "k nc"]:
-        """`G^-1` times some vectors."""
+        """`G^-1` times each of `k` vectors."""
         return self.schur.solve(right)

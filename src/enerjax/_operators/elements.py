@@ -1,4 +1,4 @@
-"""Large systems as sums over elements: rods, springs, any row of the constraints."""
+"""Potentials and constraints of large systems as sums over elements, such as springs."""
 
 from collections.abc import Callable
 from typing import TypeAlias
@@ -15,12 +15,12 @@ from .._types import Args, Coordinates, Scalar
 from .interval import gradient_with_time, Time
 
 
-# A function whose entries are added up, each of a few coordinates.
+# A function whose entries each depend on a few coordinates; their sum is an energy.
 Summands: TypeAlias = Callable[[Coordinates], Float[Array, " elements"]]
 
 
-def is_weight(system: System, q: Coordinates, args: Args) -> bool:
-    """Whether the potential of a large system is linear: it then has no stiffness."""
+def has_linear_potential(system: System, q: Coordinates, args: Args) -> bool:
+    """Whether a large system has a linear potential, and therefore no stiffness."""
     if q.size <= LARGE or isinstance(system.potential, Elements):
         return False
     hessian = jacobian_pattern(jax.grad(lambda q: system.potential(q, args)), q)
@@ -28,7 +28,7 @@ def is_weight(system: System, q: Coordinates, args: Args) -> bool:
 
 
 def element_energies(system: System, q: Coordinates, args: Args) -> list[Summands] | None:
-    """The elements that the potential of a large system is the sum of, if it is known."""
+    """The summands of the potential of a large system, or `None` if they are unknown."""
     potential = system.potential
     if q.size <= LARGE or not isinstance(potential, Elements):
         return None
@@ -42,9 +42,9 @@ def gradient_and_work_by_rows(
     a: tuple[Coordinates, Time],
     b: tuple[Coordinates, Time],
 ) -> tuple[Coordinates, Scalar | None]:
-    """Like `gradient_and_work`, but each summand of `fixed` is corrected by itself.
+    """Like `gradient_and_work`, but with a separate correction for each summand.
 
-    One correction along the whole increment would couple all bodies with each other.
+    A single correction along the whole increment would couple all bodies with each other.
     """
     (qa, ta), (qb, tb) = a, b
     total, work = jnp.zeros_like(qa), None

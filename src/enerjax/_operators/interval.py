@@ -1,4 +1,4 @@
-"""What describes an interval of a step: its unknowns, its rows, and gradients over it."""
+"""The unknowns and rows of an interval of a step, and discrete gradients over it."""
 
 import functools
 from collections.abc import Callable
@@ -12,12 +12,12 @@ from .._discrete import AbstractDerivative
 from .._types import Coordinates, JointMultipliers, Multipliers, Scalar
 
 
-# The time of a state: a number in a system with forces or driven constraints, else `None`.
+# The time of a state, or `None` for a system without forces and driven constraints.
 Time: TypeAlias = Scalar | None
 
 
 def time_rate(t: Time) -> Time:
-    """The rate of change of time: one, or `None` where no time enters."""
+    """The derivative of the time with respect to itself: one, or `None` without a time."""
     return None if t is None else jnp.ones_like(t)
 
 
@@ -35,8 +35,8 @@ class Increment(eqx.Module):
     change of the constraint; `rate` is a coordinate per time, and its row a generalised
     momentum. The unknown is the rate and not `q`, because the rounding error of `q` would
     enter the velocities divided by `h`. An unknown and its row have reciprocal units, so
-    one set of `Scales` serves both. The fields stand in the order in which velocities
-    depend on them, because Jacobians are evaluated for neighbouring unknowns at a time.
+    one set of `Scales` serves both. Jacobians are evaluated for ranges of neighbouring
+    unknowns, so the fields that the velocities depend on are neighbours.
     """
 
     impulse: Multipliers
@@ -46,13 +46,13 @@ class Increment(eqx.Module):
 
 
 class Gradient(eqx.Module):
-    """A gradient of the energy, with its multipliers, at a state or over an interval.
+    """A gradient of the energy, including constraints, at a state or over an interval.
 
     - `impulse`: `h dH/dq`, shape `(nq,)`; a generalised momentum.
     - `rate`: `dH/dp`, shape `(np,)`, a rate of the coordinates; empty where the velocities
       are eliminated.
-    - `work`: `h dH/dt`, an energy: the work of the driven constraints. `None` without any,
-      and in an interval in which no time passes.
+    - `work`: `h dH/dt`, the work of the driven constraints (energy). `None` if there are
+      none, and over a jump, in which no time passes.
     """
 
     impulse: Coordinates
@@ -60,25 +60,26 @@ class Gradient(eqx.Module):
     work: Scalar | None = None
 
     def less(self, load: Coordinates | None) -> "Gradient":
-        """This gradient less a force, which is given as `h Lm^T f`."""
+        """This gradient minus the impulse `h Lm^T f` of a force."""
         if load is None:
             return self
         return Gradient(self.impulse - load, self.rate, self.work)
 
 
 class Scales(eqx.Module):
-    """How large a unit of each unknown is in the square root of an energy.
+    """Factors that give rates and impulses the dimension of the square root of an energy.
 
-    `coordinate`: of a rate of change of each coordinate (square root of a mass).
-    `constraint`: of the rate of change of each constraint, in the same measure; so
-    `rate * coordinate`, `constraint rate / constraint` and
-    `impulse * constraint` all have the dimension of the square root of an energy.
+    - `coordinate`: the square root of the inertia of each coordinate. `rate * coordinate`
+      is the square root of an energy.
+    - `constraint`: the norm of the gradient of each constraint in the metric of the inverse
+      inertia. `constraint rate / constraint` and `impulse * constraint` are the square root
+      of an energy.
+    - `constraint_size`: the size of the terms whose sum is the constraint. The machine
+      epsilon times this size is the round-off of the constraint.
     """
 
     coordinate: Float[Array, " nq"]
     constraint: Float[Array, " nc"]
-    # The size of the terms that the constraints are differences of. Times the machine
-    # epsilon it is the round-off of the constraints.
     constraint_size: Float[Array, " nc"]
 
 
@@ -91,16 +92,16 @@ def gradient_and_work(
     weights: Coordinates | float = 1.0,
     size: Scalar | float = 0.0,
 ) -> tuple[Coordinates, Scalar | None]:
-    """The discrete gradient of `fixed(x) + driven(x, t)`, and its part in `t`.
+    """The discrete gradient of `fixed(x) + driven(x, t)`, and its component for `t`.
 
-    `driven` is differenced over `x` and `t` together, so that
+    The discrete gradient of `driven` is taken with respect to `x` and `t` jointly, so that
 
         D . (xb - xa) + Dt (tb - ta) = driven(xb, tb) - driven(xa, ta)
 
-    Corrected forms put their correction into `Dt` alone. It is bounded there even where
-    nothing moves, and driven constraints do work through `Dt` only. What does not depend
-    on time is differenced by itself, because its own defect would otherwise be counted as
-    work of the driven constraints.
+    The correction of a corrected discrete derivative is added to `Dt` alone. There it is
+    bounded even if `x` does not change, and only `Dt` contains the work of the driven
+    constraints. `fixed` has a discrete gradient of its own, because its correction would
+    otherwise be counted as work of the driven constraints.
     """
     (xa, ta), (xb, tb) = a, b
     gradient = functools.partial(derivative.gradient, weights=weights, size=size)
@@ -120,7 +121,7 @@ def gradient_with_time(
     a: tuple[Coordinates, Time],
     b: tuple[Coordinates, Time],
 ) -> tuple[Coordinates, Scalar]:
-    """The part in `x` and the part in `t` of the joint discrete gradient."""
+    """The components for `x` and for `t` of the joint discrete gradient."""
     (xa, ta), (xb, tb) = a, b
     assert ta is not None
     assert tb is not None

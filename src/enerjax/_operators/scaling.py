@@ -1,4 +1,4 @@
-"""What scales the step equations to order one, so that Newton needs to know no units."""
+"""The scaling of the step equations to order one, and estimates of the local error."""
 
 from typing import Any
 
@@ -13,24 +13,24 @@ from .base import AbstractModel
 from .interval import Increment
 
 
-# What Newton may try to resolve of that round-off. It stops where corrections no longer
-# shrink; a floor at the round-off itself would let stiff springs stop it before.
-_BEYOND = 0.01
+# The smallest scale of the balance of momentum, as a fraction of the size of the forces.
+# Larger scales would end Newton's method too early where springs are stiff.
+_ROUND_OFF_PART = 0.01
 
 
 def scales_like(
     z: PyTree[Any], model: AbstractModel, start: State, h: Scalar
 ) -> tuple[PyTree[Any], PyTree[Any], Scalar]:
-    """The sizes of the unknowns in `z`, and of the rows that stand in their places.
+    """The scales of the unknowns in `z`, those of the rows, and `least` of `find_root`.
 
-    Unknowns can turn out smaller: a stiff spring stops a body long before its force has
-    acted for all of a step. The last value is the part down to which it is not round-off.
+    Scaled unknowns can be much smaller than one: a stiff spring stops a body long before
+    its force has acted for a whole step. Below `least` they are round-off.
     """
     scales = model.scales
     root = jnp.sqrt(model.energy_scale(start, h))
     forces = jnp.abs(h) * model.force_size(start)
-    # At rest the unknowns are the round-off of the rows, which is far below their floor,
-    # and of the coordinates; Newton compares its corrections with their size.
+    # At rest the computed unknowns are round-off of the forces and of the coordinates.
+    # Newton's corrections are measured relative to the unknowns, so they need this floor.
     rounding = jnp.maximum(
         forces / scales.coordinate, scales.coordinate * jnp.abs(start.q / h)
     )
@@ -52,11 +52,11 @@ def scales_like(
         if not is_increment(x):
             return jnp.ones_like(x)
         joint = scales.constraint[: x.velocity_impulse.size]
-        # A constraint is a difference of numbers that can be large against what a step
-        # changes: its rows are resolved to the round-off of those.
+        # A constraint is a difference of terms that can be much larger than their change
+        # in a step. Its row cannot be more accurate than the round-off of these terms.
         position = root * scales.constraint + scales.constraint_size / jnp.abs(h)
-        # Those of the momenta not much beyond the round-off of the terms of the forces.
-        momentum = jnp.maximum(root * scales.coordinate, _BEYOND * forces)
+        # Likewise, the balance of momentum is limited by the round-off of the forces.
+        momentum = jnp.maximum(root * scales.coordinate, _ROUND_OFF_PART * forces)
         rate = (root / scales.coordinate)[: x.momentum.size]
         return Increment(position[: x.impulse.size], momentum, rate, root * joint)
 
@@ -67,11 +67,13 @@ def scales_like(
 def roughness(
     coordinate: Coordinates, added: PyTree[Any], before: PyTree[Any], unit: PyTree[Any]
 ) -> Float[Array, " 3"]:
-    """How large the second and the third difference of velocities are, from step to step.
+    """The norms of the second and third differences of the velocities of the last steps.
 
-    Of what steps add to a free flight, this one and the three before: in the square root
-    of an energy, without derivatives. And the second in parts of that of the step, by the
-    units of the unknowns.
+    They are computed from `added` and `before`: the differences between the unknowns and
+    their values without forces, for this step and for the three steps before. Returns the
+    norm of the second difference and that of the third (square root of an energy), and the
+    norm of the second difference in the scales `unit` of the unknowns. They have zero
+    derivatives.
     """
     is_increment = lambda x: isinstance(x, Increment)
     leaves = lambda z: jax.tree.leaves(z, is_leaf=is_increment)
@@ -79,38 +81,41 @@ def roughness(
     rates = jnp.concatenate([ends(added)[None], ends(before)])
     new, old = jnp.diff(rates, n=2, axis=0)
     size = lambda x: jnp.linalg.norm(x * coordinate)
-    # The larger of two: a difference that passes through zero is no sign of anything.
+    # The larger of two successive differences, because one of them can pass through zero.
     second = jnp.maximum(size(new), size(old))
     part = jnp.linalg.norm(new / ends(unit))
     return jax.lax.stop_gradient(jnp.stack([second, size(new - old), part]))
 
 
 def local_error(sizes: Float[Array, "stages 3"], order: int) -> Scalar:
-    """What a step is off by, in velocities, as the square root of an energy.
+    """An estimate of the local error of the velocities (square root of an energy).
 
-    Of the trapezoidal rule a sixth of the second difference. Methods of higher order are
-    better by powers of the angle in a step, which the third difference tells, and by the
-    constants of Gauss' methods; not where the motion is not resolved: where differences
-    alternate, and a step is off by a good part of its velocities.
+    `sizes` are the values of `roughness`. The estimate for order 2 is a sixth of the second
+    difference, as for the trapezoidal rule. The ratio of the third to the second difference
+    estimates the phase angle `omega h` of a step. For methods of higher order, the estimate
+    is multiplied by a power of that angle and divided by a constant of Gauss methods. It is
+    not reduced where the step does not resolve the motion, which shows in alternating
+    differences that are not small relative to the velocities.
     """
     second, third, part = sizes.T
     angle = jnp.clip(third / jnp.where(second > 0, second, 1), _LEAST_ANGLE, 2.0)
-    resolved = (angle < _RESOLVED) | (part < _CALM)
-    better = jnp.where(resolved, angle ** (order - 2) / _BETTER[order], 1.0)
+    resolved = (angle < _RESOLVED) | (part < _SMALL_DIFFERENCE)
+    better = jnp.where(resolved, angle ** (order - 2) / _ERROR_RATIO[order], 1.0)
     return jnp.sum(better * second) / 6
 
 
-# An angle in a step beyond which no order helps, and one that is not told from none (a
-# method of order 1 divides by it); and the size of a second difference that is no noise.
+# The phase angle above which a step does not resolve the motion; the smallest phase angle
+# (a method of order 1 divides by it); and the scaled size of a second difference below
+# which the motion counts as resolved at any angle.
 _RESOLVED = 1.2
 _LEAST_ANGLE = 1e-3
-_CALM = 0.3
-# The error of the midpoint rule over that of a method of this order, at an angle of one.
-_BETTER = {1: 1.0, 2: 1.0, 3: 6.0, 4: 60.0, 6: 8400.0, 8: 2.1e6}
+_SMALL_DIFFERENCE = 0.3
+# The error of the midpoint rule over that of a method of this order, at a phase angle of 1.
+_ERROR_RATIO = {1: 1.0, 2: 1.0, 3: 6.0, 4: 60.0, 6: 8400.0, 8: 2.1e6}
 
 
 def shortened(flight: PyTree[Any], part: float) -> PyTree[Any]:
-    """A free flight that goes a part of the way."""
+    """The unknowns of a free flight with its rates multiplied by `part`."""
     is_increment = lambda x: isinstance(x, Increment)
     way = lambda x: eqx.tree_at(lambda x: x.rate, x, part * x.rate)
     change = lambda x: way(x) if is_increment(x) else x

@@ -1,14 +1,14 @@
-"""Constant inertia: the velocities are eliminated, and are no unknowns.
+"""Systems with constant inertia; their velocities are eliminated from the step equations.
 
-The part of the discrete gradient in the momenta is `M^-1` times the mean momentum, and the
-contribution of `psi`. As `psi = C(q) v` is linear in `v`, its difference splits into a part
-in positions and one in velocities without any metric between the two,
+The momentum component of the discrete gradient is `M^-1` times the mean momentum, plus the
+contribution of `psi`. As `psi = C(q) v` is linear in `v`, its difference is the sum of a
+term in the positions and a term in the velocities, and no metric on `(q, v)` is needed:
 
     psi_b - psi_a = [D_q (C v_m)] (q_b - q_a) + 1/2 (C_a + C_b) (v_b - v_a),
 
-(with `D_q` over positions and time where constraints are driven, and `psi` affine in `v`).
-Of the velocities at the end of an interval only their mean enters `S_mu`, so the schemes
-solve that row for the velocities in closed form.
+(For driven constraints `D_q` includes the time, and `psi` is affine in `v`.) Only the mean
+of the velocities at the ends of an interval enters `S_mu`, so the schemes solve this row
+for the velocities in closed form.
 """
 
 from collections.abc import Callable
@@ -36,29 +36,34 @@ from .._system import AbstractKinematics, IdentityKinematics, State, System
 from .._types import Args, Coordinates, JointMultipliers, Multipliers, Scalar, Velocities
 from .base import AbstractModel, Reaction
 from .constraint_matrix import ConstraintMatrix
-from .elements import element_energies, gradient_and_work_by_rows, is_weight, Summands
+from .elements import (
+    element_energies,
+    gradient_and_work_by_rows,
+    has_linear_potential,
+    Summands,
+)
 from .interval import Gradient, gradient_and_work, Increment, Scales, Time, time_rate
 
 
 class SeparableModel(AbstractModel):
-    """A `System` at fixed `args`; in its states `v` are the velocities."""
+    """A `System` for fixed `args`; the `v` of its states are the velocities."""
 
     system: System
     args: Args
     inertia: Symmetric
     inverse_inertia: Symmetric
     scales: Scales
-    # Whether the potential is linear; determined for large systems only.
-    is_weight: bool = eqx.field(static=True)
+    # Whether the potential is linear; always false for small systems.
+    has_linear_potential: bool = eqx.field(static=True)
     kinematics: AbstractKinematics
-    # Of `constraint_matrix`; `None` where there is none.
+    # The index tables of `constraint_matrix`; `None` where there is none.
     constraint_tables: SchurTables | None = eqx.field(static=True)
 
     def __init__(self, system: System, state: State, args: Args):
         self.system = system
         self.args = args
-        self.is_weight = is_weight(system, state.q, args)
-        self.kinematics = system.kinematics.in_parts(state.q, self.coordinate, args)
+        self.has_linear_potential = has_linear_potential(system, state.q, args)
+        self.kinematics = system.kinematics.with_blocks(state.q, self.coordinate, args)
         self.inertia = system.inertia(state, args)
         self.inverse_inertia = inverse_of(self.inertia)
         self.scales = self._scales(state)
@@ -101,7 +106,7 @@ class SeparableModel(AbstractModel):
         return Gradient(h * jax.grad(self._potential)(state.q), jnp.zeros((0,), h.dtype))
 
     def coordinate(self, q: Coordinates) -> Float[Array, " ncc"]:
-        """The relations between redundant coordinates."""
+        """The coordinate constraints, which relate redundant coordinates of a body."""
         if self.system.coordinate_constraint is None:
             return jnp.zeros((0,), q.dtype)
         return self.system.coordinate_constraint(q, self.args)
@@ -185,7 +190,7 @@ class SeparableModel(AbstractModel):
         if fixed.velocity_impulse.size > 0:
             rows += [lambda q: h * fixed.velocity_impulse * rate(q)]
         impulse, work = gradient_and_work_by_rows(derivative, rows, with_time, *ends)
-        if self.is_weight:
+        if self.has_linear_potential:
             impulse = impulse + h * jax.grad(self._potential)(a.q)
         return Gradient(impulse, none, work)
 
@@ -216,11 +221,11 @@ class SeparableModel(AbstractModel):
         return jax.jvp(lambda q: self.joint(q, t), (q,), (self.lift(q, v),))[1]
 
     def metric(self, state: State) -> Symmetric:
-        """The inertia in the coordinates, made regular where they are redundant.
+        """The inertia matrix of the coordinates, regular also where they are redundant.
 
-        `L^T M L + sum_i g_i b_i b_i^T` with the gradients `b_i` of the coordinate
-        constraints, Euclidean along them: `g_i` gives them the mean inertia of a
-        coordinate, so the choice is independent of the units of the constraint.
+        It is `L^T M L + m sum_i b_i b_i^T`, with the normalised gradients `b_i` of the
+        coordinate constraints. `m` is the mean inertia of a coordinate, so the result does
+        not depend on the units of the constraints.
         """
         if self.has_canonical_rates:
             return self.inertia
@@ -248,8 +253,10 @@ class SeparableModel(AbstractModel):
         return Assembled(tuple(row_hessians(fn, state.q) for fn in fns)), self.inertia
 
     def _element_energies(self, q: Coordinates) -> list[Summands] | None:
-        """The nonlinear elements of the potential of a large system, if they are known."""
-        return [] if self.is_weight else element_energies(self.system, q, self.args)
+        """The summands of the potential of a large system, or `None`; see `elements.py`."""
+        if self.has_linear_potential:
+            return []
+        return element_energies(self.system, q, self.args)
 
     def augmented_energy(self, state: State, multipliers: Multipliers) -> Scalar:
         return self._potential(state.q) + multipliers @ self.constraint(state.q, state.t)
@@ -278,7 +285,7 @@ class SeparableModel(AbstractModel):
         return ConstraintMatrix(inverse_inertia, rows)
 
     def _constraint_tables(self, state: State) -> SchurTables | None:
-        # Constraints that repeat each other make the matrix singular.
+        # Redundant constraints make the matrix singular.
         is_flat = self.has_canonical_rates and self.system.coordinate_constraint is None
         if not is_flat or self.system.redundant:
             return None
@@ -287,10 +294,11 @@ class SeparableModel(AbstractModel):
         return schur_tables(joint, state.q, self.inverse_inertia)
 
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
-        """The constraints enter with their second derivatives in time.
+        """Solves the equations of motion with the joints at acceleration level.
 
-        Coordinate constraints have no acceleration level of their own; their multipliers
-        complete the `nq` rows of the balance of momentum.
+        Coordinate constraints are not differentiated, because the rates `L^+ v` satisfy
+        them for every `v`. Their multipliers enter the `nq` rows of the balance of
+        momentum.
         """
         q, v, t, scales = state.q, state.v, state.t, self.scales
         qdot = self.lift(q, v)
@@ -303,8 +311,8 @@ class SeparableModel(AbstractModel):
 
         def conditions(x: Array) -> Array:
             acceleration, multipliers = unit * x[: v.size], x[v.size :] / scales.constraint
-            # Evaluated in here, because the sparsity pattern of the conditions is found
-            # from indices that are constants of this function.
+            # Evaluated in this function, because the sparsity pattern is found from index
+            # arrays that are constants of the traced function.
             pulled = self.pull(q, q, self.inertia @ acceleration)
             pulled = pulled + self.constraint_force(q, t, multipliers)
             rate = self.joint_change(q, acceleration, t) + free_rate
@@ -320,7 +328,7 @@ class SeparableModel(AbstractModel):
         return unit * x[: v.size], x[v.size :] / scales.constraint
 
     def multipliers(self, state: State) -> Multipliers:
-        """By the constraints alone where `L = I`, which needs a smaller matrix."""
+        """With `L = I` the multipliers are found from the smaller matrix `B M^-1 B^T`."""
         inverse_inertia = self.inverse_inertia
         is_plain = self.has_canonical_rates and isinstance(inverse_inertia, Array)
         if not is_plain or self.system.redundant:
@@ -333,6 +341,6 @@ class SeparableModel(AbstractModel):
         return solve(matrix, right - rows @ free) / self.scales.constraint
 
     def _free_joint_acceleration(self, state: State, qdot: Coordinates) -> JointMultipliers:
-        """`dpsi/dt` in a motion with constant velocities `v`."""
+        """`dpsi/dt` of a motion with constant velocities `v`."""
         rates = lambda q, t: self.joint_rate(q, state.v, t)
         return jax.jvp(rates, (state.q, state.t), (qdot, time_rate(state.t)))[1]

@@ -1,7 +1,9 @@
-"""One solve of the step equations: predict, find the root, finish.
+"""One solve of the step equations: initial guess, Newton's method, end of the step.
 
-Here the physics scales what Newton sees: rates by the inertia, multipliers by the
-gradients of their constraints, and everything by an energy of the step.
+The unknowns are scaled to order one before the solve: rates by the inertia, multipliers by
+the gradients of their constraints, and all of them by a typical energy of the step. Initial
+guesses are the unknowns of a free flight, which is a step without forces, plus an
+extrapolation of the differences between the last steps and their free flights.
 """
 
 from typing import Any
@@ -34,24 +36,27 @@ from ..schemes import (
 )
 
 
-# Enough for the linear convergence of a locking step; a step that needs more has failed.
+# Enough for the linear convergence of a step that locks. A step that needs more has failed.
 MAX_ITERATIONS = 50
-# Steps before a chord iteration is tried again after one that has failed. What makes it
-# fail (stiff forces, fast turns) lasts for some steps, and trying costs a few residuals.
+# The number of steps without the chord method after it has failed. The causes of a failure
+# (stiff forces, fast rotations) usually last for several steps, and each attempt costs a
+# few evaluations of the residual.
 _CHORD_WAITS = 10
 
 
 class Memory(eqx.Module):
-    """What the last steps leave for a solve.
+    """The data of the last steps that a solve uses.
 
-    - `added`: what the last three steps added to a free flight, newest first.
-    - `is_smooth`: whether extrapolating from these would have met the last step better
-      than repeating.
-    - `factors`: of the Jacobians of the last three steps, newest first; `None` for large
-      systems, and where a chord iteration has its own.
-    - `chord_wait`: how many steps are solved without trying a chord iteration; `None` where
-      there is none to try.
-    - `carried`: what a scheme with a memory hands on; of others `None`.
+    - `added`: the unknowns of the last three steps minus those of a free flight, newest
+      first.
+    - `is_smooth`: whether the extrapolation of `added` was a better guess for the last step
+      than the step before it.
+    - `factors`: the factors of the Jacobians of the last three steps, newest first; `None`
+      for large systems, and where the chord method is used.
+    - `chord_wait`: the number of steps until the chord method is tried again; `None` where
+      the equations have no chord method.
+    - `carried`: the data that a scheme with a memory passes to its next step; `None` for
+      other schemes.
     """
 
     added: PyTree[Any]
@@ -62,15 +67,15 @@ class Memory(eqx.Module):
 
 
 class Solved(eqx.Module):
-    """A solve, done or failed.
+    """The result of a solve, which may have failed.
 
-    - `end`: what it leads to.
-    - `iterations`: of Newton.
-    - `residual`: largest entry of the step equations, scaled to order one, before the last
+    - `end`: the end of the step.
+    - `iterations`: the number of corrections.
+    - `residual`: the largest residual of the scaled step equations before the last
       correction.
-    - `result`: whether, and how, it failed.
+    - `result`: success, or the kind of failure.
     - `roughness`: differences of velocities from step to step; see `_operators/scaling.py`.
-    - `memory`: for the next.
+    - `memory`: the data for the next solve.
     """
 
     end: StepEnd
@@ -90,7 +95,7 @@ def first_memory(
     multipliers: Multipliers,
     with_chord: bool = True,
 ) -> Memory:
-    """The memory of a run that begins; without `with_chord` no chord iteration is made."""
+    """The memory at the start of a run; `with_chord=False` excludes the chord method."""
     carried = None
     if isinstance(scheme, AbstractSchemeWithMemory):
         carried = scheme.begin(model, start, h, acceleration)
@@ -135,7 +140,7 @@ def solve(
     root_finder: RootFinder,
     skip: Flag,
 ) -> Solved:
-    """A step of length `h` of a scheme; with `skip` it costs no iteration."""
+    """Solves a step of length `h`. With `skip` it makes no iteration; see `find_root`."""
     problem = _problem(scheme, model, start, h, memory.carried)
     flight = _free_flight(scheme, problem, model, start)
     unknown_scale, row_scale, least = scales_like(flight, model, start, h)
@@ -158,10 +163,10 @@ def solve(
         guess,
         inputs,
         max_iterations=MAX_ITERATIONS,
-        # What the last steps suggest can lie beyond a fold of the step equations, a flight
-        # without force on the near side, or where rods turn far in it, a part of that.
+        # The extrapolated guess can lie beyond a fold of the step equations. A free flight
+        # usually does not, and a fraction of it does not if bodies rotate far in a step.
         others=[scale_down(shortened(flight, part)) for part in (1.0, 0.5, 0.25)],
-        factors=jax.tree.map(_next, memory.factors),
+        factors=jax.tree.map(_extrapolated, memory.factors),
         skip=skip,
         regularisation=_regularisation(model, unknown_scale, row_scale),
         least=least,
@@ -171,21 +176,21 @@ def solve(
     z = jax.tree.map(jnp.multiply, root.value, unknown_scale)
     end = scheme.finish(z, problem)
     found = from_root_finder(root.found, root.broken, root.finite)
-    turns = _turns(model, start, end.state)
-    turned = RESULTS.where(turns, RESULTS.step_too_large, RESULTS.successful)
+    reverses = _gradients_reverse(model, start, end.state)
+    branch = RESULTS.where(reverses, RESULTS.step_too_large, RESULTS.successful)
     added = jax.lax.stop_gradient(jax.tree.map(jnp.subtract, z, flight))
     return Solved(
         end=end,
         iterations=root.iterations,
         residual=root.residual,
-        result=first_failure(first_failure(end.result, found), turned),
+        result=first_failure(first_failure(end.result, found), branch),
         roughness=roughness(model.scales.coordinate, added, memory.added, unknown_scale),
         memory=_memory_after(memory, added, unknown_scale, root, end.carried),
     )
 
 
 def _chord(scheme: AbstractOneSolveScheme) -> Chord:
-    """Corrections with inertia and constraints alone."""
+    """The corrections of the chord method of a scheme, for scaled unknowns and rows."""
     assert isinstance(scheme, AbstractSchemeWithChord)
 
     def prepare(x, inputs):
@@ -203,15 +208,16 @@ def _chord(scheme: AbstractOneSolveScheme) -> Chord:
 
 
 def num_unknowns(memory: Memory) -> int:
-    """How many unknowns a solve has."""
+    """The number of unknowns of a solve."""
     return sum(x[0].size for x in jax.tree.leaves(memory.added))
 
 
 def _predicted(memory: Memory) -> PyTree[Any]:
-    """What a step is expected to add to a free flight.
+    """The predicted difference between the unknowns of a step and those of a free flight.
 
-    Smooth motion is met by extrapolation; where it changes quickly the last step is the
-    better guess. What would have been better for the step before decides.
+    For a smooth motion this is an extrapolation of the last three steps, and for one that
+    changes quickly it is the difference of the last step. The choice is the one that would
+    have been better for the last step.
     """
     smooth, last = _candidates(memory)
     choose = lambda x, y: jnp.where(memory.is_smooth, x, y)
@@ -219,8 +225,8 @@ def _predicted(memory: Memory) -> PyTree[Any]:
 
 
 def _candidates(memory: Memory) -> tuple[PyTree[Any], PyTree[Any]]:
-    """What a step may add to a free flight: the extrapolation, and the last step again."""
-    smooth = jax.tree.map(_next, memory.added)
+    """The two predictions: the extrapolation, and the difference of the last step."""
+    smooth = jax.tree.map(_extrapolated, memory.added)
     return smooth, jax.tree.map(lambda x: x[0], memory.added)
 
 
@@ -231,7 +237,7 @@ def _memory_after(
     root: Root,
     carried: PyTree[Any],
 ) -> Memory:
-    """The memory with a step that added `added` to a free flight."""
+    """The memory after a step whose difference from a free flight is `added`."""
 
     def error(guess: PyTree[Any]) -> Scalar:
         difference = lambda x, y, unit: (x - y) / unit
@@ -239,9 +245,9 @@ def _memory_after(
 
     smooth, last = _candidates(memory)
     return Memory(
-        added=jax.tree.map(_pushed, added, memory.added),
+        added=jax.tree.map(_shifted, added, memory.added),
         is_smooth=error(smooth) <= error(last),
-        factors=jax.tree.map(_pushed, root.factors, memory.factors),
+        factors=jax.tree.map(_shifted, root.factors, memory.factors),
         chord_wait=_wait_after(memory.chord_wait, root),
         carried=carried,
     )
@@ -254,20 +260,21 @@ def _wait_after(wait: Count | None, root: Root) -> Count | None:
     return jnp.where(wait == 0, passed, wait - 1).astype(wait.dtype)
 
 
-def _next(x: Array) -> Array:
-    """What follows the last three, newest first, on a parabola."""
+def _extrapolated(x: Array) -> Array:
+    """The quadratic extrapolation of the last three values, which are newest first."""
     return 3 * x[0] - 3 * x[1] + x[2]
 
 
-def _pushed(new: Array, old: Array) -> Array:
-    """The last three, one step later."""
+def _shifted(new: Array, old: Array) -> Array:
+    """The last three values after a step with the value `new`."""
     return jnp.stack([new, old[0], old[1]])
 
 
-def _turns(model: AbstractModel, a: State, b: State) -> Flag:
-    """Whether the gradient of a joint turns by more than a right angle from `a` to `b`.
+def _gradients_reverse(model: AbstractModel, a: State, b: State) -> Flag:
+    """Whether a constraint gradient rotates by more than a right angle from `a` to `b`.
 
-    A solution of the step equations on the other side of a joint satisfies the joint too.
+    The step equations can have a solution in another configuration of a joint, such as the
+    mirrored one. It satisfies the constraint too, but does not continue the motion.
     """
     if model.system.constraint is None:
         return jnp.array(False)
@@ -280,7 +287,7 @@ def _turns(model: AbstractModel, a: State, b: State) -> Flag:
 
 
 def _with_multipliers(z: PyTree[Any], values: PyTree[Any]) -> PyTree[Any]:
-    """Unknowns with the multipliers of others."""
+    """The tree `z` with the multipliers of `values`."""
     parts = lambda x: (x.impulse, x.velocity_impulse)
     is_increment = lambda x: isinstance(x, Increment)
     change = lambda x, y: eqx.tree_at(parts, x, parts(y)) if is_increment(x) else x
@@ -288,27 +295,27 @@ def _with_multipliers(z: PyTree[Any], values: PyTree[Any]) -> PyTree[Any]:
 
 
 def _regularisation(model: AbstractModel, unknown_scale: Any, row_scale: Any) -> Any | None:
-    """What makes the step equations regular where constraints repeat each other.
+    """The regularisation of the step equations of systems with redundant constraints.
 
-    Weighed by the scales of row and unknown, so that the multipliers of least norm are
-    those of least norm in the measure of their constraints.
+    It is weighted by the scales of rows and unknowns, so that the multipliers have the
+    least norm of `impulse * constraint`; see `Scales`.
     """
     if not model.system.redundant:
         return None
 
-    def weigh(unit: Array, row: Array) -> Array:
+    def weighted(unit: Array, row: Array) -> Array:
         product = unit * row
         share = jnp.min(product, initial=jnp.inf) / product
         return share * jnp.asarray(model.regularisation(unit.size, unit.dtype))
 
     none = jax.tree.map(jnp.zeros_like, unknown_scale)
-    return _with_multipliers(none, jax.tree.map(weigh, unknown_scale, row_scale))
+    return _with_multipliers(none, jax.tree.map(weighted, unknown_scale, row_scale))
 
 
 def _free_flight(
     scheme: AbstractOneSolveScheme, problem: Any, model: AbstractModel, start: State
 ) -> PyTree[Any]:
-    """The unknowns of a step in which no force acts."""
+    """The unknowns of a step without forces and multipliers."""
     num_constraints = jax.eval_shape(model.constraint, start.q, start.t).shape[0]
     no_force = jnp.zeros((num_constraints,), start.q.dtype)
     return scheme.predict(problem, jnp.zeros_like(start.v), no_force)

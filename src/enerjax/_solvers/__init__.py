@@ -1,4 +1,4 @@
-"""Newton's method, roots with their derivatives, and linear algebra; no mechanics."""
+"""Newton's method, differentiable roots and linear algebra. Contains no mechanics."""
 
 from .linear.assembled import Assembled as Assembled, row_hessians as row_hessians
 from .linear.blocks import (
@@ -19,10 +19,10 @@ from .linear.dense import (
 )
 from .linear.independent_blocks import (
     constant_entries as constant_entries,
-    multiply_parts as multiply_parts,
-    Parts as Parts,
-    parts_of as parts_of,
-    solve_parts as solve_parts,
+    independent_blocks as independent_blocks,
+    IndependentBlocks as IndependentBlocks,
+    multiply_by_blocks as multiply_by_blocks,
+    solve_by_blocks as solve_by_blocks,
 )
 from .linear.jacobian import (
     affine_root as affine_root,

@@ -1,8 +1,8 @@
-"""Chord iterations: one approximate inverse serves a whole search.
+"""The chord method: all corrections of a search use one approximate Jacobian.
 
-Where the Jacobian hardly differs from a matrix that is known in closed form, corrections
-with that matrix shrink the residual quickly, and each costs one evaluation of it. The
-search is given up as soon as they do not: Newton's method follows.
+Where the Jacobian is close to a matrix whose inverse is known in closed form, corrections
+with that inverse reduce the residual quickly, and each of them costs one evaluation of the
+residual. If they do not reduce it quickly, the search stops and Newton's method follows.
 """
 
 from collections.abc import Callable
@@ -17,10 +17,10 @@ from .newton import Newton, Start
 from .newton_iterations import correction_size, max_norm, powers_of
 
 
-# The search is given up where a correction leaves more than this part of the residual:
-# Newton's method is then cheaper.
+# The search stops without a root where a correction leaves more than this fraction of the
+# residual: Newton's method is then cheaper.
 _SHRINKS = 0.5
-# Corrections after which it is given up.
+# The search also stops without a root after this many corrections.
 _PATIENCE = 16
 
 Vector = Float[Array, " n"]
@@ -32,9 +32,10 @@ class _Chord(eqx.Module):
     - `x`: the unknowns.
     - `defect`: the largest residual at the iterate that was corrected last; infinite
       before the first correction.
-    - `contraction`: `defect` divided by the one before; zero before there are two.
-    - `corrections`: how many have been made.
-    - `done`, `failed`: whether the search has converged, or is given up.
+    - `contraction`: `defect` divided by the `defect` of the correction before; zero before
+      the second correction.
+    - `corrections`: the number of corrections so far.
+    - `done`, `failed`: whether the search has converged, or has stopped without a root.
     """
 
     x: Vector
@@ -52,10 +53,11 @@ def chord_iterations(
     start: Start,
     guess: Vector,
 ) -> _Chord:
-    """Searches the root of `value` with the corrections `solve(value(x))`.
+    """Searches a root of `value` with the corrections `solve(value(x))`.
 
-    Residuals decide, because some unknowns are small and not well determined: those of the
-    velocity-level constraints, whose rows are.
+    Convergence is measured mainly by the residual. Corrections alone would be misleading:
+    the multipliers of the velocity-level constraints are small and poorly determined,
+    although their equations are satisfied accurately.
     """
     powers = powers_of(guess.dtype)
 
@@ -66,13 +68,14 @@ def chord_iterations(
         defect, size = max_norm(right), correction_size(step, x, start.least, powers)
         contraction = defect / before.defect
         rate = jnp.maximum(contraction, before.contraction)
-        # The residual that this correction leaves; unknown after the first.
+        # An estimate of the residual after this correction. The first correction has no
+        # contraction to estimate it from.
         left = jnp.where(before.corrections > 0, rate, 1.0) * defect
-        # A light, slow body beside a heavy, fast one has a small residual: corrections must
-        # be small too.
+        # A light, slow body contributes little to the residual beside a heavy, fast one, so
+        # the correction must be small too.
         done = (left <= newton.rtol * powers.eps) & (rate * size <= powers.moderate)
         done = done | ((defect <= newton.atol * powers.eps) & (size <= powers.small))
-        # A residual that is almost round-off, and shrinks no longer, is round-off.
+        # A residual of almost round-off size that stops decreasing is round-off.
         shrinks = contraction < _SHRINKS
         done = done | (~shrinks & (defect <= powers.round_off) & (size <= powers.small))
         done = done & jnp.isfinite(size)

@@ -1,4 +1,4 @@
-"""What a user decides of Newton's method, and where one of its searches begins."""
+"""The options of Newton's method, and the initial data of one search."""
 
 import equinox as eqx
 import lineax as lx
@@ -12,38 +12,48 @@ from .linear.user_solver import AbstractSparseSolver
 
 
 class Newton(eqx.Module):
-    """Newton's method on a problem scaled to order one, down to round-off.
+    """Newton's method, which solves the scaled step equations to round-off.
 
-    It begins with a chord iteration where the system has constant inertia and `v = qdot`:
-    with the inertia and the gradients of the constraints in the middle of the step, whose
-    matrix is factorised once. Where that does not contract (stiff forces, fast turns) the
-    exact Jacobian follows.
+    **Chord method.** Where the system has constant inertia and `v = qdot`, a search begins
+    with an approximate Jacobian that contains the inertia and the constraint gradients in
+    the middle of the step, and no stiffness. It is factorised once. If it does not reduce
+    the residual quickly (stiff forces, fast rotations), the exact Jacobian is used.
 
-    One Jacobian serves several corrections, with an approximate inverse that is
-    extrapolated from those of the steps before, and improved. It is renewed where the
-    corrections `c_k` would shrink by less than three; such a correction is not made. Where
-    the first one after that of a new Jacobian is larger still, that went too far: it is
-    halved, up to seven times (P. Deuflhard's natural monotonicity test). Stops after a
-    correction whose error, predicted to be `c_k max(c_k / c_{k-1}, c_{k-1})`, is of
-    round-off size, or which was computed from a residual that is, or where corrections that
-    did shrink no longer do: coordinates far from the origin are too coarse for more. An
-    iteration that breaks down, or has not converged with 12 Jacobians, begins again from a
-    second guess, and then, without damping, from others: damping can end where the
-    residual has a smallest value that is no root, which full corrections leave.
+    **Jacobians.** One exact Jacobian is used for several corrections. The approximate
+    inverse of a small Jacobian is extrapolated from those of the last three steps and then
+    improved iteratively. Let `c_k` be the size of correction `k`. The Jacobian is evaluated
+    again where `c_k > 0.3 c_{k-1}`, and that correction is discarded.
+
+    **Damping.** Where the second correction with a Jacobian is hardly smaller than the
+    first one, the first one was too long: it is halved, up to seven times (P. Deuflhard's
+    natural monotonicity test).
+
+    **Convergence.** The search ends when one of these holds:
+
+    - The predicted error `c_k max(c_k / c_{k-1}, c_{k-1})` is of round-off size.
+    - The residual is of round-off size.
+    - Corrections are small and stop decreasing. This is the limit of the precision where
+      coordinates lie far from the origin.
+
+    **Restarts.** A search that becomes non-finite, or has not converged with 12 Jacobians,
+    begins again from a second guess. If that fails too, it begins again from further
+    guesses without damping, because a damped search can end at a local minimum of the
+    residual that is no root.
 
     **Arguments:**
 
     - `rtol`: bound on the predicted error, in units of round-off of the dtype.
     - `atol`: bound on the residual, in the same units.
-    - `linear_solver`: for its corrections and for derivatives of the root: an
-      `AbstractSparseSolver`, such as `KLU()`, given the entries of the Jacobian that can
-      differ from zero, or one of lineax, given the dense Jacobian. Without it size and
-      structure decide: plain operations up to 32 unknowns, LAPACK, and above 64 the
-      narrow band that the pattern of the equations can be numbered into, if there is one.
-      Derivatives are exact.
+    - `linear_solver`: the solver for the corrections and for derivatives of the root. An
+      `AbstractSparseSolver`, such as `KLU()`, receives the structurally nonzero entries of
+      the Jacobian; a solver of lineax receives the dense Jacobian. By default the size and
+      the sparsity decide: up to 32 unknowns plain array operations, beyond that LAPACK,
+      and above 64 unknowns a banded solver if the unknowns can be ordered such that the
+      Jacobian is a narrow band. Derivatives are as accurate as
+      the solutions of the solver.
 
-    A `linear_solver` of another type raises a `TypeError`, a bound that is not positive a
-    `ValueError`.
+    Raises a `TypeError` for a `linear_solver` of another type, and a `ValueError` for a
+    bound that is not positive.
     """
 
     rtol: float = 1.0
@@ -67,17 +77,19 @@ class Newton(eqx.Module):
 
 
 class Start(eqx.Module):
-    """Where a solve begins.
+    """The initial data of a search.
 
-    - `guess`: first values of the unknowns.
-    - `others`: guesses for further attempts: the first of them with damping, the rest
-      without.
-    - `factors`: of the Jacobian of the solve before, where it is kept.
-    - `skip`: return the guess without an iteration.
-    - `by_chord`: whether to try a chord iteration first, where there is one.
-    - `regularisation`: for each unknown, what is added to the diagonal of a Jacobian that
-      may be singular; see `find_root`.
-    - `least`: where all unknowns are smaller, it is by round-off.
+    - `guess`: the initial values of the unknowns.
+    - `others`: the guesses for further attempts. The first of these attempts is damped, the
+      others are not.
+    - `factors`: the factors of the Jacobian of an earlier solve; `None` where they are not
+      kept.
+    - `skip`: whether to return the guess without an iteration.
+    - `by_chord`: whether to try the chord method first, where the equations have one.
+    - `regularisation`: the numbers added to the diagonal of a Jacobian that may be
+      singular, one for each unknown; see `find_root`.
+    - `least`: the scaled size below which unknowns are round-off. Corrections are measured
+      relative to the largest unknown, but to no less than this.
     """
 
     guess: PyTree[Array]

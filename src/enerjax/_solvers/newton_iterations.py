@@ -1,7 +1,7 @@
-"""The iterations of Newton's method, for arguments and values scaled to order one.
+"""The iterations of Newton's method, for unknowns and residuals scaled to order one.
 
-An iteration proposes a correction, classifies it by the sizes of this correction and of the
-one before, and takes it, halves the one before, or asks for a new Jacobian.
+An iteration computes a correction and compares its size with that of the correction before.
+It then accepts the correction, halves the correction before, or requests a new Jacobian.
 """
 
 from typing import NamedTuple
@@ -21,34 +21,36 @@ from .newton import Newton, Start
 
 # Thresholds of the method -----------------------------------------------------------------
 
-# Jacobians after which the first guess is given up. Searches that reach quadratic
-# convergence reach it earlier.
+# The number of Jacobians after which a search continues from another guess. Searches that
+# converge quadratically need fewer.
 PATIENCE = 12
-# Jacobians of an attempt without damping. For a double pendulum with a 200 times lighter
-# inner mass, at h = 0.01, the steps that need such an attempt and find a root with up to 20
-# Jacobians follow the branch of the motion. Those that take longer mostly do not.
+# The number of Jacobians of an attempt without damping. The limit was found with a double
+# pendulum whose inner mass is 200 times lighter, at h = 0.01: roots that such an attempt
+# finds with up to 20 Jacobians continue the motion, and later ones usually do not.
 _UNDAMPED_PATIENCE = 20
-# A Jacobian serves on while corrections shrink at least by this factor. A weaker correction
-# is not made, although the approximate inverse might improve it: that inverse cannot see
-# directions that have become soft since, and a light body stays unresolved behind a heavy
-# one until corrections are exact.
+# A Jacobian is kept while each correction is smaller than the one before by this factor.
+# Otherwise the correction is discarded, even if it might help: an outdated Jacobian lacks
+# directions whose stiffness has decreased since it was evaluated, and the motion of a light
+# body beside a heavy one is not resolved until the Jacobian is exact.
 _SHRINKS = 0.3
-# This many stalled corrections in a row end a search far from the origin.
+# Where coordinates lie far from the origin, a search ends after this many corrections in a
+# row that do not decrease.
 _STALLS = 4
-# The smallest part of a correction that damping tries.
-_LEAST_PART = 0.01
+# The smallest fraction of a correction that damping accepts.
+_LEAST_FRACTION = 0.01
 
 
 class Powers(NamedTuple):
     """Thresholds that depend on the precision: powers of the machine epsilon.
 
-    - `floor`: the least size, as a part of the largest unknown, by which an unknown is
-      measured.
-    - `small`: a correction, or a residual, below this is in the range of convergence.
-    - `moderate`: a residual above this is no round-off, wherever the coordinates are.
-    - `tiny`: a residual below this is round-off if a new Jacobian does not improve it.
-    - `round_off`: a residual below this is round-off if the same Jacobian, which did
-      improve it, no longer does.
+    - `floor`: a correction of an unknown is measured relative to that unknown plus this
+      fraction of the largest unknown.
+    - `small`: a correction or a residual below this is in the range of convergence.
+    - `moderate`: a residual above this is not round-off, however far from the origin the
+      coordinates lie.
+    - `tiny`: a residual below this is round-off if a new Jacobian does not reduce it.
+    - `round_off`: a residual below this is round-off if a Jacobian that has reduced it
+      before no longer does.
     """
 
     eps: float
@@ -76,7 +78,7 @@ def powers_of(dtype: jnp.dtype) -> Powers:
 
 
 def max_norm(x: PyTree[Array]) -> Scalar:
-    """The largest entry; for residuals and corrections, which are all scaled."""
+    """The largest absolute value of scaled residuals or corrections."""
     return largest(ravel_pytree(x)[0])
 
 
@@ -85,10 +87,10 @@ def correction_size(
 ) -> Scalar:
     """The size of a correction that leads to `x`, relative to the unknowns.
 
-    Every unknown is compared with itself: one scale for all would hide a light, slow body
-    beside a heavy, fast one. The floor is for unknowns that pass through zero. It follows
-    the largest unknown, down to `least`, for where all unknowns are far smaller than their
-    scales.
+    The correction of each unknown is divided by that unknown, because a common scale would
+    hide the error of a light, slow body beside a heavy, fast one. A floor is added for
+    unknowns that pass through zero. It is proportional to the largest unknown, but to no
+    less than `least`, because all unknowns can be far smaller than their scales.
     """
     floor = powers.floor * jnp.clip(largest(x), least, 1.0)
     return largest(step / (jnp.abs(x) + floor))
@@ -98,24 +100,26 @@ class _Iterate(eqx.Module):
     """The state of a search.
 
     - `x`: the unknowns.
-    - `factors`: of the Jacobian in use.
-    - `step`, `part`: the last correction that was computed with a new Jacobian, and the
-      part of it that was taken.
-    - `size`: of the last correction, relative to the unknowns; infinite before the first.
-    - `contraction`: `size` divided by that of the correction before, if both were computed
-      with the same Jacobian, else zero.
-    - `corrections`, `jacobians`: how many have been computed.
-    - `stalls`: new Jacobians in a row whose correction was small and did not shrink.
-    - `defect`: the largest residual at the iterate that was corrected last.
-    - `fresh`: whether the factors are of the Jacobian at `x`.
-    - `stale`: whether the Jacobian is to be renewed.
+    - `factors`: the factors of the current Jacobian.
+    - `step`, `fraction`: the last correction that was computed with a new Jacobian, and the
+      fraction of it that was applied.
+    - `size`: the size of the last correction, relative to the unknowns; infinite before the
+      first correction.
+    - `contraction`: `size` divided by the size of the correction before, if both were
+      computed with the same Jacobian, else zero.
+    - `corrections`, `jacobians`: the number of corrections and of Jacobians so far.
+    - `stalls`: the number of consecutive new Jacobians whose correction was small and not
+      smaller than the correction before.
+    - `defect`: the largest residual before the last correction.
+    - `fresh`: whether the factors are those of the Jacobian at `x`.
+    - `stale`: whether the Jacobian must be evaluated again.
     - `done`, `broken`: whether the search has converged, or has become non-finite.
     """
 
     x: Float[Array, " n"]
     factors: AbstractFactors
     step: Float[Array, " n"]
-    part: Scalar
+    fraction: Scalar
     size: Scalar
     contraction: Scalar
     corrections: Count
@@ -131,7 +135,10 @@ class _Iterate(eqx.Module):
 def newton_iterations(
     residual: Linearisable, newton: Newton, start: Start, max_jacobians: int
 ) -> _Iterate:
-    """A search; `max_jacobians` bounds the two attempts with damping together."""
+    """A search from several guesses, one after the other, until one converges.
+
+    The two damped attempts together use at most `max_jacobians` Jacobians.
+    """
     guesses = jnp.stack([ravel_pytree(x)[0] for x in (start.guess, *start.others)])
     factors = residual.first_factors(start.factors, guesses[0])
     first = _first_iterate(factors, guesses[0], jnp.array(0), start.skip)
@@ -159,7 +166,7 @@ def _first_iterate(
         x=x,
         factors=factors,
         step=jnp.zeros_like(x),
-        part=one,
+        fraction=one,
         size=infinite,
         contraction=zero,
         corrections=corrections,
@@ -208,10 +215,13 @@ def _attempt(
 
 
 class _Correction(NamedTuple):
-    """A correction, the unknowns that it leads to, and its size, relative to these.
+    """A correction that has been computed, and not yet accepted.
 
-    `contraction` compares the size with that of the correction before; `shrinks` says
-    whether that is enough. `defect` is the largest residual that is corrected.
+    - `step`, `x`: the correction, and the unknowns after it.
+    - `size`: its size, relative to these unknowns.
+    - `contraction`: `size` divided by the size of the correction before.
+    - `shrinks`: whether `contraction` is small enough to keep the Jacobian.
+    - `defect`: the largest residual before the correction.
     """
 
     step: Float[Array, " n"]
@@ -223,7 +233,12 @@ class _Correction(NamedTuple):
 
 
 class _Verdict(NamedTuple):
-    """Whether the residual is round-off, whether the search ends, and stalls in a row."""
+    """The state of the convergence tests.
+
+    - `is_root`: whether the residual is round-off.
+    - `done`: whether the search has converged.
+    - `stalls`: as in `_Iterate`.
+    """
 
     is_root: Flag
     done: Flag
@@ -257,21 +272,22 @@ def _classify(
 ) -> _Verdict:
     _, _, size, contraction, shrinks, defect = correction
     fresh, small = iterate.fresh, size <= powers.small
-    # The contraction of a chord iteration measures the error of its Jacobian, and stays
-    # what it is. A better one is an accident, so the bound on the next correction uses at
-    # least the contraction of the correction before, and at least that correction itself,
-    # by whose size the Jacobian has changed.
+    # The contraction of corrections with one Jacobian measures the error of that Jacobian,
+    # which is nearly constant. A single smaller contraction is therefore coincidence, and
+    # the bound on the next correction uses at least the contraction of the correction
+    # before. It also uses at least the size of that correction, because the exact Jacobian
+    # has changed by an amount of this size.
     rate = jnp.maximum(jnp.maximum(contraction, iterate.contraction), iterate.size)
     converged = size * rate <= newton.rtol * powers.eps
     converged = ~fresh & shrinks & converged & (defect <= powers.small)
     is_root = (defect <= newton.atol * powers.eps) & small
-    # Corrections with one Jacobian that did shrink, and no longer do, have met round-off.
+    # Corrections with one Jacobian that have decreased and stop decreasing are round-off.
     met = ~fresh & ~shrinks & (iterate.contraction > 0)
     met = met & (defect <= powers.round_off) & small
-    # So has a correction with a new Jacobian that does not shrink. Where the residual is
-    # not tiny (coordinates a million lengths from the origin) this must happen several
-    # times in a row, and the residual must not be large: a residual can have a smallest
-    # value that is no root.
+    # A small correction with a new Jacobian that is not smaller than the one before is
+    # round-off too, if the residual is tiny. It is larger where coordinates lie a million
+    # lengths from the origin. It then must not decrease several times in a row, and must
+    # not be large, because the residual can have a local minimum that is no root.
     stalled = fresh & small & ~shrinks
     stalls = jnp.where(fresh, jnp.where(stalled, iterate.stalls + 1, 0), iterate.stalls)
     repeatedly = (stalls == _STALLS) & (defect <= powers.moderate)
@@ -287,23 +303,25 @@ def _next_iterate(
     damped: Flag | bool,
     powers: Powers,
 ) -> _Iterate:
-    """Takes the correction, or halves the one before, or asks for a new Jacobian."""
-    fresh, part = iterate.fresh, iterate.part
+    """Accepts the correction, halves the one before, or requests a new Jacobian."""
+    fresh, fraction = iterate.fresh, iterate.fraction
     taken = fresh | correction.shrinks | verdict.is_root
-    # The first correction after one with a new Jacobian measures how far that went wrong.
-    # If it is larger than it would be after a good one, and than round-off, the one before
-    # is halved (P. Deuflhard's natural monotonicity test).
+    # The second correction with a Jacobian estimates the error after the first one. If it
+    # has not decreased enough and is larger than round-off, the first one is halved
+    # (P. Deuflhard's natural monotonicity test).
     is_second = ~fresh & (iterate.contraction == 0) & (iterate.size > powers.small)
-    is_monotone = correction.contraction <= 1 - 0.25 * part
-    halves = damped & is_second & ~is_monotone & ~verdict.done & (part > _LEAST_PART)
-    part = jnp.where(halves, 0.5 * part, jnp.ones_like(part))
-    x_otherwise = jnp.where(halves, iterate.x + part * iterate.step, iterate.x)
+    is_monotone = correction.contraction <= 1 - 0.25 * fraction
+    halves = (
+        damped & is_second & ~is_monotone & ~verdict.done & (fraction > _LEAST_FRACTION)
+    )
+    fraction = jnp.where(halves, 0.5 * fraction, jnp.ones_like(fraction))
+    x_otherwise = jnp.where(halves, iterate.x + fraction * iterate.step, iterate.x)
     changes = (taken | halves).astype(iterate.corrections.dtype)
     return _Iterate(
         x=jnp.where(taken, correction.x, x_otherwise),
         factors=iterate.factors,
         step=jnp.where(fresh, correction.step, iterate.step),
-        part=part,
+        fraction=fraction,
         size=jnp.where(taken, correction.size, iterate.size),
         contraction=jnp.where(fresh | halves, 0, correction.contraction),
         corrections=iterate.corrections + changes,

@@ -1,8 +1,8 @@
-"""The one nonlinear driver: every step equation of the package is solved here.
+"""The solution of nonlinear equations; the step equations of all schemes are solved here.
 
-It knows no mechanics. It takes a function whose arguments and values are scaled to
-order one, and finds its root, by default with `Newton`. Derivatives of the root follow
-from the implicit function theorem, in forward and in reverse mode.
+The equations are those of a function whose arguments and values are scaled to order one.
+Its root is found by `Newton`, or by a root finder of optimistix. The derivatives of the
+root follow from the implicit function theorem, in forward and in reverse mode.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,7 +23,7 @@ from .newton import Newton, Start
 from .search import Chord, flat_of, flattened, Root, RootFinder, search
 
 
-# The name under which a policy of `jax.checkpoint` knows the value of a root.
+# The name by which policies of `jax.checkpoint` refer to the value of a root.
 ROOT = "enerjax_root"
 
 
@@ -36,10 +36,10 @@ def _root(fn, chord, root_finder, args, start, max_iterations):
 def _root_jvp(primals, tangents):
     fn, chord, root_finder, args, start, max_iterations = primals
     t_args = tangents[3]
-    # Apart: derivatives neither trace nor need how it is found.
+    # The search is compiled as a function of its own, because it is not differentiated.
     again = lambda: _root(fn, chord, root_finder, args, start, max_iterations)
     root = in_one_function(again)()
-    # All that the derivatives of a step need of the search for it.
+    # The derivatives of a step use these results of the search, and no others.
     root = eqx.tree_at(
         lambda root: (root.value, root.found, root.broken, root.finite),
         root,
@@ -51,31 +51,32 @@ def _root_jvp(primals, tangents):
     flat, unravel, flat_fn = flattened(fn, root.value)
     by_args = lambda moved: flat_fn(flat, eqx.combine(moved, fixed))
     _, rate = jax.jvp(by_args, (moved,), (t_args,))
-    given = root_finder.linear_solver if isinstance(root_finder, Newton) else None
+    linear_solver = root_finder.linear_solver if isinstance(root_finder, Newton) else None
     regularisation = flat_of(args[-1])
-    linear = linearisable(flat_fn, flat, args, given, regularisation)
+    linear = linearisable(flat_fn, flat, args, linear_solver, regularisation)
     change = linear.solve(flat, -rate)
     if regularisation is not None:
-        change = change + _turned(linear, flat_fn, flat, (moved, fixed), t_args)
-    # Nothing but the root itself depends on the arguments: not how it was found.
+        change = change + _null_space_rate(linear, flat_fn, flat, (moved, fixed), t_args)
+    # Only the value of the root is differentiated. Its statistics have zero tangents.
     still = jax.tree.map(jnp.zeros_like, eqx.filter(root, eqx.is_inexact_array))
     return root, eqx.tree_at(lambda root: root.value, still, unravel(change))
 
 
-def _turned(
+def _null_space_rate(
     linear: Linearisable,
     fn: Callable[[Array, PyTree], Array],
     root: Float[Array, " n"],
-    parts: tuple[PyTree, PyTree],
+    moved_and_fixed: tuple[PyTree, PyTree],
     t_args: PyTree,
 ) -> Float[Array, " n"]:
-    """How fast a root of least size moves into what the equations leave open.
+    """The part of the tangent of a least-norm root in the null space of the Jacobian.
 
-    That part turns with the arguments, and the root stays orthogonal to it. The root is the
-    limit of the roots `r` of `fn(r) + regularisation r = 0` as the regularisation vanishes.
-    Their derivatives show this part at `r`, which is one correction off the root.
+    The null space rotates as the arguments change. The least-norm root stays orthogonal to
+    it, so its tangent has a part in the null space. It is found from the roots `r` of
+    `fn(r) + regularisation r = 0`, which tend to the least-norm root as the regularisation
+    tends to zero. `r` is one correction away from the root.
     """
-    moved, fixed = parts
+    moved, fixed = moved_and_fixed
 
     def regularised(moved: PyTree, at: Array) -> Array:
         args = eqx.combine(moved, fixed)
@@ -85,7 +86,7 @@ def _turned(
     solve = linear.regularised_solver(root)
     regular = root - solve(linear.regularisation * root)
     _, rate = jax.jvp(lambda moved: regularised(moved, regular), (moved,), (t_args,))
-    return linear.open_part(solve, linear.regularised_solver(regular)(-rate))
+    return linear.null_space_part(solve, linear.regularised_solver(regular)(-rate))
 
 
 def find_root(
@@ -103,23 +104,25 @@ def find_root(
     chord: Chord | None = None,
     by_chord: Flag | bool = True,
 ) -> Root:
-    """The root of `fn(y, args)`. Never raises.
+    """A root of `fn(y, args)`. Failures are reported in the `Root`, not raised.
 
-    The implicit function theorem gives its derivatives with respect to `args`, with one
-    linear solve each. A singular lane of a batch has non-finite derivatives of its own and
-    leaves the others alone. `guess`, `factors` (of a solve before) and `others` (guesses
-    that `Newton` turns to if it fails) only say where to begin. With `skip`, `Newton`
-    returns the guess without an iteration.
+    The derivatives with respect to `args` follow from the implicit function theorem, with
+    one linear solve each. A lane of a batch whose Jacobian is singular has non-finite
+    derivatives, and does not affect those of other lanes.
 
-    `regularisation` is for equations that leave a combination of the unknowns open: small
-    numbers that are added to the diagonal of the Jacobian and make it regular. The root is
-    then the one of least size, in the norm that `regularisation` weights, and so are its
-    derivatives. If all unknowns turn out smaller than one, they are resolved relative to
-    their own size, down to `least`.
+    The search begins at `guess`, with the `factors` of an earlier solve if there are any.
+    If it fails, `Newton` tries the guesses `others` in their order. None of these affects
+    the derivatives. With `skip`, `Newton` returns the guess without an iteration.
 
-    With a `chord`, and if `by_chord`, `Newton` searches with its corrections first, and
-    with the exact Jacobian only where that search has failed. The root and its derivatives
-    are those of `fn` in any case.
+    A `regularisation` is needed where the equations do not determine all unknowns. It is a
+    set of small numbers that are added to the diagonal of the Jacobian and make it regular.
+    The result is then the root of least norm, weighted by `regularisation`, with its
+    derivatives. Unknowns that are all smaller than one are resolved relative to the largest
+    of them, but to no less than `least`.
+
+    With a `chord`, and if `by_chord` is true, `Newton` first tries the chord method, and
+    uses the exact Jacobian only where that fails. The root and its derivatives are those of
+    `fn` in either case.
     """
     flat, _ = ravel_pytree(guess)
     start = Start(
@@ -132,11 +135,11 @@ def find_root(
         least=jnp.asarray(least, flat.dtype),
     )
     start = jax.lax.stop_gradient(start)
-    traced, opened = _opened(fn, guess, args)
+    traced, opened = _explicit_closure(fn, guess, args)
     call = lambda y, inputs: opened(inputs[0], y, inputs[1])
     of_chord = None
     if chord is not None:
-        of_chord, prepare = _opened(chord.prepare, guess, args)
+        of_chord, prepare = _explicit_closure(chord.prepare, guess, args)
         correct = chord.correct
         chord = Chord(
             lambda y, inputs: prepare(inputs[2], y, inputs[1]),
@@ -146,12 +149,12 @@ def find_root(
     return _root(call, chord, root_finder, inputs, start, max_iterations)
 
 
-def _opened(fn: Callable, *like: Any) -> tuple[Any, Callable]:
-    """What is traced of that which `fn` closes over, and `fn` as a function of it too."""
-    # Functions in `args` may hold traced numbers. (The lambda has a closure, without which
-    # the conversion would not look for any.)
+def _explicit_closure(fn: Callable, *like: Any) -> tuple[Any, Callable]:
+    """The traced values in the closure of `fn`, and `fn` with these as first argument."""
+    # Functions in `args` may contain traced numbers. (`filter_closure_convert` skips
+    # functions without a closure, so `fn` is wrapped in a lambda, which has one.)
     closed = lambda *args: fn(*args)
     converted = eqx.filter_closure_convert(closed, *like)
-    # What is known stays closed over: indices tell which unknowns a row depends on.
+    # Known values stay in the closure: the sparsity pattern is found from known indices.
     traced, known = eqx.partition(converted, lambda x: not is_known(x))
     return traced, lambda traced, *args: eqx.combine(traced, known)(*args)

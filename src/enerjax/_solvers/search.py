@@ -26,10 +26,11 @@ RootFinder = TypeAliasType(
 
 
 class Chord(NamedTuple):
-    """Corrections with a matrix that is close to the Jacobian and is known in closed form.
+    """The corrections of the chord method, whose approximate Jacobian is constant.
 
-    - `prepare(y, args)`: what all corrections of a search share, found near the guess `y`.
-    - `correct(value, args, prepared)`: the correction of a residual.
+    - `prepare(y, args)`: factorises the approximate Jacobian at the guess `y`.
+    - `correct(value, args, prepared)`: the correction for the residual `value`, where
+      `prepared` is the result of `prepare`.
     """
 
     prepare: Callable[[PyTree[Array], Any], PyTree]
@@ -40,13 +41,13 @@ class Root(eqx.Module):
     """A root, or the last iterate where none was found.
 
     - `value`: the unknowns.
-    - `factors`: for the next solve.
-    - `iterations`: corrections made.
-    - `residual`: its largest entry; of `Newton` before the last correction.
-    - `found`: whether they converged.
-    - `broken`: whether they became singular or non-finite.
-    - `finite`: whether the residual is.
-    - `by_chord`: whether a chord iteration has found it.
+    - `factors`: the factors of the last Jacobian, for the next solve.
+    - `iterations`: the number of corrections.
+    - `residual`: the largest residual; with `Newton` the one before the last correction.
+    - `found`: whether the search has converged.
+    - `broken`: whether the Jacobian was singular, or an iterate became non-finite.
+    - `finite`: whether the residual is finite.
+    - `by_chord`: whether the chord method has found the root.
     """
 
     value: PyTree[Array]
@@ -60,7 +61,7 @@ class Root(eqx.Module):
 
 
 def flattened(fn: Callable, value: PyTree[Array]) -> tuple[Array, Callable, Callable]:
-    """A value as a vector, its inverse, and `fn` between vectors."""
+    """`value` as a vector, the inverse of that map, and `fn` as a function of vectors."""
     flat, unravel = ravel_pytree(value)
     return flat, unravel, lambda x, args: ravel_pytree(fn(unravel(x), args))[0]
 
@@ -87,7 +88,7 @@ def search(
         )
         steps = solution.stats["num_steps"]
         residual = max_norm(fn(solution.value, args))
-        # Tolerances finer than the unknowns can be resolved end at `max_iterations`.
+        # A tolerance below round-off is never met, and the search ends at `max_iterations`.
         found = found | (residual <= Newton().atol * jnp.finfo(residual.dtype).eps)
         return Root(
             value=solution.value,
@@ -100,16 +101,16 @@ def search(
             by_chord=jnp.array(False),
         )
     flat, _, flat_fn = flattened(fn, start.guess)
-    given, regularisation = root_finder.linear_solver, flat_of(start.regularisation)
-    exact = linearisable(flat_fn, flat, args, given, regularisation)
-    if chord is None or given is not None:
+    linear_solver, regularisation = root_finder.linear_solver, flat_of(start.regularisation)
+    exact = linearisable(flat_fn, flat, args, linear_solver, regularisation)
+    if chord is None or linear_solver is not None:
         return _iterated(exact, root_finder, start, max_iterations)
-    # Apart: the search that follows it where it fails may not be possible in one function.
+    # Separate from the Newton search, which may not be compilable into one function.
     by_chord = lambda: _by_chord(exact, chord, root_finder, args, start)
     first = in_one_function(by_chord)()
 
     def again() -> Root:
-        # (The lanes of a batch all come here.)
+        # Under `vmap` this is evaluated for all lanes, also for those with a root.
         left = eqx.tree_at(lambda start: start.skip, start, start.skip | first.found)
         last = _iterated(exact, root_finder, left, max_iterations)
         last = eqx.tree_at(
@@ -146,7 +147,9 @@ def _iterated(
     last = newton_iterations(residual, newton, start, max_jacobians)
     x = last.x
     if residual.regularisation is not None:
-        x = jnp.where(last.done & ~start.skip, _least(residual, last.factors, x), x)
+        x = jnp.where(
+            last.done & ~start.skip, _least_norm_root(residual, last.factors, x), x
+        )
     keeps = residual.keeps_factors and start.factors is not None
     factors = last.factors if keeps else start.factors
     return Root(
@@ -161,13 +164,13 @@ def _iterated(
     )
 
 
-def _least(
+def _least_norm_root(
     residual: Linearisable, factors: AbstractFactors, x: Float[Array, " n"]
 ) -> Float[Array, " n"]:
-    """The root of least size, from one with a part that the equations leave open.
+    """The root of least norm: `x` without its part in the null space of the Jacobian.
 
-    The Jacobian must be the one at the root: the regularisation is small, and the error of
-    any other is divided by it.
+    The Jacobian must be that at the root, because errors of the Jacobian are divided by
+    the regularisation, which is small.
     """
     matrix = residual.jacobian(x)
     once = factors.renewed(matrix).solve
@@ -176,10 +179,11 @@ def _least(
         first = once(right)
         if not isinstance(factors, Inverse):
             return first
-        # The inverse of what is nearly singular loses digits, which a correction finds.
+        # The inverse of a nearly singular matrix is inaccurate; one refinement corrects it.
         return first + once(right - matrix @ first)
 
-    closed = x - residual.open_part(solve, x)
-    # Equations that are not linear in these unknowns may tell them apart, by little.
+    closed = x - residual.null_space_part(solve, x)
+    # Where the equations are nonlinear in these unknowns, the residual has changed. One
+    # more correction compensates for this.
     change = solve(residual.value(closed))
-    return closed - change + residual.open_part(solve, change)
+    return closed - change + residual.null_space_part(solve, change)

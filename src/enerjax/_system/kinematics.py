@@ -14,7 +14,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._programs import jacobian_pattern
-from .._solvers import constant_entries, multiply_parts, Parts, parts_of, solve_parts
+from .._solvers import (
+    constant_entries,
+    independent_blocks,
+    IndependentBlocks,
+    multiply_by_blocks,
+    solve_by_blocks,
+)
 from .._types import Args, Coordinates, Velocities
 
 
@@ -22,7 +28,7 @@ class AbstractKinematics(eqx.Module):
     """The map `L(q)` from rates of coordinates to velocities, `nv x nq`."""
 
     @abc.abstractmethod
-    def in_parts(
+    def with_blocks(
         self,
         q: Coordinates,
         coordinate: Callable[[Coordinates], Float[Array, " ncc"]],
@@ -58,7 +64,7 @@ class AbstractKinematics(eqx.Module):
 class IdentityKinematics(AbstractKinematics):
     """`v = qdot`: point masses, minimal coordinates with constant inertia."""
 
-    def in_parts(self, q, coordinate, args):
+    def with_blocks(self, q, coordinate, args):
         return self
 
     def push(self, q, rate, args):
@@ -79,33 +85,33 @@ class ConfigurationKinematics(AbstractKinematics):
 
     matrix: Callable[[Coordinates, Args], Float[Array, "nv nq"]]
     # The independent blocks of `L` stacked on `B_c`, if there are several.
-    parts: Parts | None = eqx.field(static=True, default=None)
+    blocks: IndependentBlocks | None = eqx.field(static=True, default=None)
 
-    def in_parts(self, q, coordinate, args):
+    def with_blocks(self, q, coordinate, args):
         of_rates = constant_entries(lambda inputs: self.matrix(*inputs), (q, args))
         relations = jacobian_pattern(lambda q: coordinate(q), q)
         if of_rates is None or relations is None:
             return self
         of_relations = np.where(relations.toarray(), np.nan, 0)
-        parts = parts_of(np.concatenate([of_rates, of_relations]))
-        return ConfigurationKinematics(self.matrix, parts)
+        blocks = independent_blocks(np.concatenate([of_rates, of_relations]))
+        return ConfigurationKinematics(self.matrix, blocks)
 
     def push(self, q, rate, args):
         matrix = self.matrix(q, args)
-        if self.parts is None:
+        if self.blocks is None:
             return matrix @ rate
         square = jnp.pad(matrix, ((0, q.size - len(matrix)), (0, 0)))
-        return multiply_parts(self.parts, square, rate)[: len(matrix)]
+        return multiply_by_blocks(self.blocks, square, rate)[: len(matrix)]
 
     def pull(self, q, momentum, args):
-        if self.parts is None:
+        if self.blocks is None:
             return momentum @ self.matrix(q, args)
         _, pull = jax.vjp(lambda rate: self.push(q, rate, args), jnp.zeros_like(q))
         return pull(momentum)[0]
 
     def lift(self, q, v, coordinate_jacobian, args):
         square = jnp.concatenate([self.matrix(q, args), coordinate_jacobian(q)])
-        return solve_parts(self.parts, square, jnp.pad(v, (0, q.size - v.size)))
+        return solve_by_blocks(self.blocks, square, jnp.pad(v, (0, q.size - v.size)))
 
     def gyroscopic(self, q, momentum, dq, args):
         # G_ij = sum_k mu_k (dL_ki/dq_j - dL_kj/dq_i), paper eq. (11), so G dq is the change

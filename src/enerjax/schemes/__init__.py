@@ -1,7 +1,7 @@
-"""The time integration schemes, and what a scheme of your own is written with.
+"""The time integration schemes, and the base classes and operators for further schemes.
 
-A scheme of your own subclasses `AbstractOneSolveScheme`; `docs/write-your-own-scheme.md`
-shows one from its equations to its tests.
+A new scheme is a subclass of `AbstractOneSolveScheme`. `docs/write-your-own-scheme.md`
+shows an example, from its equations to its tests.
 """
 
 from .._operators import (

@@ -1,4 +1,4 @@
-"""Checks of the arguments that schemes share."""
+"""Checks of arguments that several schemes have."""
 
 from typing import Any
 
@@ -44,7 +44,7 @@ def _unit_interval(name: str, number: Real) -> tuple[Scalar, bool]:
         raise TypeError(f"`{name}` must be a real number in [0, 1], got {number!r}.")
     if not is_known(number):
         return jnp.asarray(number, float), True
-    # A constant keeps its value inside `jit` too.
+    # Under `jit`, the value of a constant would be traced without this context.
     with jax.ensure_compile_time_eval():
         array = jnp.asarray(number, float)
         return array, bool(jnp.all((array >= 0) & (array <= 1)))

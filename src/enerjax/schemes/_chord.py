@@ -1,8 +1,9 @@
-"""The step equations with inertia and constraints alone, solved in closed form.
+"""The corrections of the chord method, in closed form.
 
-With the momenta `r_m`, the constraints over `h` `r_phi` and their rates `r_psi` for rows,
-and `G = B M^-1 B^T`, all terms of stiffness are left out of the Jacobian. What remains
-couples the multipliers through `G` alone, each kind of them by itself.
+The approximate Jacobian contains the inertia and the constraint gradients `B`, and omits
+all terms of the stiffness. The right-hand sides are the rows of the balance of momentum
+`r_m`, the constraints divided by `h`, `r_phi`, and their rates `r_psi`. After block
+elimination each kind of multiplier has a linear system with the matrix `G = B M^-1 B^T`.
 """
 
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from ._discontinuous import JumpAndEnd
 
 
 def step_chord(rows: Increment, constraints: ConstraintMatrix) -> Increment:
-    """For an interval with `v1 = 2 (rate - M^-1 B^T eta) - v0`.
+    """The correction of a step with `v1 = 2 (rate - M^-1 B^T eta) - v0`; it solves
 
     2 M rate + B^T (impulse - 2 eta) = r_m
     B rate = r_phi,   2 B rate - 2 G eta = r_psi
@@ -39,12 +40,13 @@ def step_chord(rows: Increment, constraints: ConstraintMatrix) -> Increment:
 def jump_chord(
     alpha: Scalar, rows: JumpAndEnd, constraints: ConstraintMatrix
 ) -> JumpAndEnd:
-    """For the two nodes of a discontinuous step, with velocities `vj`, `v1` such that
+    """The correction of a discontinuous step, whose velocities `vj` and `v1` satisfy
 
         vj + v1 = 2 (rate_1 - M^-1 B^T eta_1)
         (1 + alpha) vj = 2 rate_1 + 6 rate_j - 2 M^-1 B^T eta_j
 
-    and `M v1 + B^T impulse_1 = r_1`, `M vj - B^T (impulse_1 - impulse_j)/3 = r_j`.
+    It solves `M v1 + B^T impulse_1 = r_1` and `M vj - B^T (impulse_1 - impulse_j)/3 = r_j`,
+    with the rows of the constraints at both nodes.
     """
     alpha = alpha.astype(rows.end.rate.dtype)
     jump, end = rows.jump, rows.end
@@ -52,7 +54,7 @@ def jump_chord(
     is_ggl = end.velocity_impulse.size > 0
     s1, sj = (x.velocity_impulse for x in (end, jump))
     if not is_ggl:
-        # The positions at both nodes take the place of the velocities there.
+        # Without velocity constraints, those of the positions determine both velocities.
         sj = (2 * end.impulse + 6 * jump.impulse) / (1 + alpha)
         s1 = 2 * end.impulse - sj
     right = [constraints.product(v1) - s1, 3 * (sj - constraints.product(vj))]

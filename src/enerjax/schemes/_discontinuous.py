@@ -1,4 +1,4 @@
-"""What the discontinuous schemes have in common: a jump, and the way to the end."""
+"""The common parts of the discontinuous schemes, whose state jumps at the step's start."""
 
 from collections.abc import Callable
 
@@ -12,7 +12,7 @@ from .base import ForceLaw, StepProblem
 
 
 class JumpAndEnd(eqx.Module):
-    """The two nodes of a discontinuous step: after the jump, and at the end."""
+    """The increments to the nodes of a discontinuous step: after the jump, and the end."""
 
     jump: Increment
     end: Increment
@@ -21,10 +21,10 @@ class JumpAndEnd(eqx.Module):
 def predict_jump_and_end(
     problem: StepProblem, acceleration: Velocities, multipliers: Multipliers
 ) -> JumpAndEnd:
-    """A Taylor step over the whole length, and a jump for which `vj` is `v0`.
+    """The initial guess: a Taylor step to the end, and a jump in the positions alone.
 
-    That jump is in the positions alone. Without it the guess of `v1` would be `v0`, where
-    the equation for kappa is singular.
+    The jump of the positions is chosen such that `vj = v0`. Without it the guess of `v1`
+    would be `v0`, and the equation for kappa would be singular there.
     """
     end = problem.guess(acceleration, multipliers)
     start, lift = problem.start, lambda v: problem.model.lift(problem.start.q, v)
@@ -46,11 +46,11 @@ def split_velocities(
 def jump_gradient(
     alpha: Scalar, after: Gradient, before: Gradient, start: Gradient, jump: Gradient
 ) -> Gradient:
-    """What moves the state from `z0` to `zj`, eq. (47b):
+    """The gradient in the equations of the jump from `z0` to `zj`, eq. (47b):
 
         -(DH_g - DH_h)/3 + alpha/6 (grad H(zj) - grad H(z0))
 
-    `after` is `DH_g`, `before` is `DH_h`; `start` and `jump` are the gradients there.
+    `after` is `DH_g`, `before` is `DH_h`, `start` is `grad H(z0)`, `jump` is `grad H(zj)`.
     """
 
     def combined(g: Coordinates, h: Coordinates, x0: Coordinates, xj: Coordinates):
@@ -63,7 +63,11 @@ def jump_gradient(
 
 
 class Loads(eqx.Module):
-    """`h L^T f` over `zj -> z1`, over `z0 -> zj`, at `z0` and at `zj`."""
+    """The impulses `h L^T f` of the forces in a discontinuous step.
+
+    - `after`, `before`: over the intervals `zj -> z1` and `z0 -> zj`.
+    - `start`, `jump`: at the nodes `z0` and `zj`.
+    """
 
     after: Coordinates | None = None
     before: Coordinates | None = None
@@ -76,9 +80,10 @@ def jump_loads(
 ) -> Loads:
     """The forces of a discontinuous step; none for a system without forces.
 
-    They enter like `-grad V`, at velocities that are computed from the positions. The
-    velocity over the jump, without constraints `(v0 + vj)/2`, is written so that the work
-    of a damper is a sum of squares for any step and any constraints: with `F = -c v`
+    They enter the equations like `-grad V`, at velocities that are computed from the
+    positions. The velocity over the jump is `(v0 + vj)/2` without constraints. It is
+    written such that the work of a damper is a sum of squares for any step and any
+    constraints: with `F = -c v`
 
         W = -c h (|(q1 - q0)/h|^2 + 3 |(qj - q0)/h|^2)
     """
@@ -99,9 +104,9 @@ def _loads(
     """The fields of `Loads` for one force."""
     model, start = problem.model, problem.start
     v0, vj = model.velocity(start), model.velocity(jump)
-    lag = model.push(start.q, problem.position(z.end), z.jump.rate)
+    jump_rate = model.push(start.q, problem.position(z.end), z.jump.rate)
     half = 0.5 * alpha.astype(v0.dtype)
-    mean = problem.velocity(z.end) + 3 * lag - half * (vj - v0)
+    mean = problem.velocity(z.end) + 3 * jump_rate - half * (vj - v0)
     after = problem.load(law, jump, end, z.end, problem.velocity(z.end))
     before = problem.load(law, start, jump, z.end, mean)
     at_start = problem.load(law, start, start, z.end, v0)
@@ -116,7 +121,7 @@ def jump_work(
 
     def work(law: ForceLaw) -> Scalar:
         after, before, at_start, at_jump = _loads(law, alpha, z, problem, jump, end)
-        # The last part is the work of `alpha/6 (F_j - F_0)`.
+        # The last term is the work of `alpha/6 (F_j - F_0)`.
         over_jump = before + 0.5 * alpha.astype(before.dtype) * (at_jump - at_start)
         return after @ (z.end.rate - z.jump.rate) + over_jump @ z.jump.rate
 

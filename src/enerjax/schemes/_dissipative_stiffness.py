@@ -1,4 +1,4 @@
-"""The stiffness by which `EnergyConsistent` dissipates, fixed before a step is solved."""
+"""The stiffness matrix of the dissipation of `EnergyConsistent`, constant in a step."""
 
 import equinox as eqx
 import jax
@@ -16,11 +16,11 @@ class DissipativeStiffness(eqx.Module):
 
     With `tau = alpha h / 6`:
 
-    - `matrix`: `K+`, the semidefinite part of `K` in the metric of the inertia.
-    - `inertia`, `inverse_inertia`: `M` and `M^-1` at the same place.
+    - `matrix`: `K+`, the positive semidefinite part of `K` in the metric of the inertia.
+    - `inertia`, `inverse_inertia`: `M` and `M^-1` in the same position.
     - `jump_matrix`: `X = (M + tau^2 K+)^-1 (h/6) K+`, which gives the jump of the
       velocities, `j_v = X (dq + tau dv)`. It is empty where the stiffness is assembled
-      from elements: `X` would be a full matrix, so `j_v` is an unknown of the step.
+      from elements. `X` would then be a dense matrix, so `j_v` is an unknown instead.
     - `velocity_matrix`: `(1 + tau X)^-1`, where velocities are eliminated; else empty.
     """
 
@@ -32,11 +32,12 @@ class DissipativeStiffness(eqx.Module):
 
 
 def dissipative_stiffness(step: StepProblem, alpha: Scalar) -> DissipativeStiffness:
-    """The dissipative stiffness half-way along a motion with constant velocity.
+    """The dissipative stiffness in the middle of a motion with constant velocity.
 
-    The decay law needs only that the matrix is semidefinite, and the order only that it is
-    near the stiffness. The multipliers of the start therefore suffice. Inside of the solve
-    it would cost an eigenvalue problem in every iteration.
+    The decay of the energy requires only that the matrix is positive semidefinite, and the
+    order of accuracy only that it is close to the stiffness. Therefore it is computed from
+    the multipliers at the start. A matrix that depends on the unknowns would cost an
+    eigenvalue problem in every iteration.
     """
     model, start, h = step.model, step.start, step.h
     half_way = start.q + 0.5 * h * model.lift(start.q, start.v)
@@ -74,8 +75,9 @@ def _semidefinite_part(
 ) -> Float[Array, "nq nq"] | Assembled:
     """The positive semidefinite part in the metric of the inertia, independent of units.
 
-    For a stiffness that is assembled from elements, this is the sum of the parts of the
-    elements, each in the metric of the masses of its coordinates.
+    For a stiffness that is assembled from elements, this is the sum of the positive
+    semidefinite parts of the element matrices, each in the metric of the masses of its
+    coordinates.
     """
     if not isinstance(stiffness, Assembled):
         return _dense_part(stiffness, as_dense(inertia))

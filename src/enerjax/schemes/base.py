@@ -1,4 +1,4 @@
-"""What a scheme is, and the data, the rows and the end of one of its steps."""
+"""The base classes of schemes, and the data, the equations and the result of a step."""
 
 import abc
 from collections.abc import Callable
@@ -24,8 +24,8 @@ from .._system import State
 from .._types import Coordinates, JointMultipliers, Multipliers, Scalar, Velocities
 
 
-# The levels at which joints are imposed: positions and velocities, stabilised as by Gear,
-# Gupta and Leimkuhler; or positions only.
+# The levels at which joints are imposed: positions and velocities, with the stabilisation
+# of Gear, Gupta and Leimkuhler, or positions only.
 Formulation: TypeAlias = Literal["ggl", "index3"]
 # A force law `f(q, v, t)`, the whole force of a system or a part of it.
 ForceLaw: TypeAlias = Callable[[Coordinates, Velocities, Time], Velocities]
@@ -34,16 +34,17 @@ P = TypeVar("P")
 
 
 class Energies(eqx.Module):
-    """The energy account of a step, or of the steps since the row before.
+    """The energy balance of a step, or of all steps since the last saved state.
 
-    - `dissipated`: removed by the scheme, by its own identity.
-    - `work`: of the forces, dampers included.
-    - `damped`: taken by dampers: `-work` of the part of the forces that changes sign with
-      the velocity.
-    - `drive_work`: of the driven constraints.
+    - `dissipated`: the energy that the scheme removes, by its energy identity.
+    - `work`: the work of the forces, dampers included.
+    - `damped`: the energy that dampers remove: minus the work of the part of the forces
+      that is odd in the velocity.
+    - `drive_work`: the work of the driven constraints.
 
-    All are energies: scalars in a step, with a leading axis of rows in a solution. `None`
-    where the system has no forces, or no driven constraints. With them
+    All are energies: scalars in a step, with a leading axis of saved states in a solution.
+    `work` and `damped` are `None` for a system without forces, and `drive_work` for one
+    without driven constraints. The balance is
 
         E1 = E0 - dissipated + work + drive_work
     """
@@ -55,12 +56,12 @@ class Energies(eqx.Module):
 
 
 class StepProblem(eqx.Module):
-    """Everything that is known when a step starts.
+    """The data of a step that are known before it is solved.
 
     - `model`: the system with its `args`.
-    - `start`: the state at the start, as the model has it: in `v` velocities, or momenta.
+    - `start`: the model's state at the start; `v` contains velocities or momenta.
     - `h`: the length of the step, a scalar (time); negative in a backward stage.
-    - `derivative`: the discrete gradient; schemes that take none leave the default.
+    - `derivative`: the discrete gradient; not used by schemes without one.
     - `formulation`: the levels at which joints are imposed, `"ggl"` or `"index3"`.
     """
 
@@ -97,7 +98,7 @@ class StepProblem(eqx.Module):
 
     @property
     def separable_model(self) -> SeparableModel:
-        """The model of a problem that was made by `with_constant_inertia`."""
+        """The model of a problem that `with_constant_inertia` has returned."""
         assert isinstance(self.model, SeparableModel)
         return self.model
 
@@ -121,7 +122,7 @@ class StepProblem(eqx.Module):
         return self.start.q + self.h * increment.rate
 
     def velocity(self, end: Increment) -> Velocities:
-        """`Lm (q1 - q0)/h`: the velocity without what multipliers add to it."""
+        """`Lm (q1 - q0)/h`: the mean velocity, without the terms of the multipliers."""
         return self.model.push(self.start.q, self.position(end), end.rate)
 
     def nodes(
@@ -129,11 +130,11 @@ class StepProblem(eqx.Module):
         velocities: Callable[[Reaction], tuple[Velocities, ...]],
         *ends: tuple[Increment, Time],
     ) -> tuple[State, ...]:
-        """The states at the nodes that increments lead to, each given with its time.
+        """The states at the nodes whose increments and times are `ends`.
 
-        `velocities(reaction)` returns the velocities at the nodes, solved from the rows
+        `velocities(reaction)` must return the velocities at the nodes, solved from the rows
         `S_mu`, where `reaction(q, t, eta)` is `M^-1 C(q, t)^T eta`. It is not called where
-        momenta are unknowns.
+        the momenta are unknowns.
         """
         momenta = tuple(z.momentum for z, _ in ends)
         found = self.model.node_momenta(momenta, velocities)
@@ -146,7 +147,7 @@ class StepProblem(eqx.Module):
         return self.model.discrete_gradient(self.derivative, a, b, self.h, increment)
 
     def drive_work(self, a: State, b: State, increment: Increment) -> Scalar | None:
-        """The work of the driven constraints over `a -> b`; `None` without any."""
+        """The work of the driven constraints over `a -> b`; `None` if there are none."""
         if self.model.system.driven is None:
             return None
         return self.discrete_gradient(a, b, increment).work
@@ -154,7 +155,7 @@ class StepProblem(eqx.Module):
     def load(
         self, law: ForceLaw, a: State, b: State, end: Increment, velocity: Velocities
     ) -> Coordinates:
-        """`h Lm^T f` in the middle of `a -> b`, with `Lm` that of the step to `end`."""
+        """`h Lm^T f` in the middle of `a -> b`; `Lm` is that of the whole step to `end`."""
         assert a.t is not None
         assert b.t is not None
         force = law(0.5 * (a.q + b.q), velocity, 0.5 * (a.t + b.t))
@@ -167,7 +168,7 @@ class StepProblem(eqx.Module):
         return self.load(self.model.force, self.start, b, end, self.velocity(end))
 
     def step_work(self, b: State, end: Increment) -> Callable[[ForceLaw], Scalar]:
-        """The work that a force does in the middle of the step."""
+        """The work of a force that acts in the middle of the step, as a function of it."""
         velocity = self.velocity(end)
         return lambda law: self.load(law, self.start, b, end, velocity) @ end.rate
 
@@ -177,7 +178,7 @@ class StepProblem(eqx.Module):
         work: Callable[[ForceLaw], Scalar],
         drive_work: Scalar | None,
     ) -> Energies:
-        """The energies of a step, given the work that a force does in it."""
+        """The energy balance; `work(law)` is the work of a force law in the step."""
         if self.model.system.force is None:
             return Energies(dissipated, None, None, drive_work)
         total, damping = work(self.model.force), work(self.model.damping)
@@ -189,9 +190,9 @@ class StepProblem(eqx.Module):
         work: Callable[[ForceLaw], Scalar],
         drive_work: Scalar | None,
     ) -> Energies:
-        """The energies of a step of a scheme without an energy identity.
+        """The energy balance of a scheme without an energy identity.
 
-        All that is missing in the balance counts as `dissipated`, of either sign.
+        `dissipated` is the measured loss `E0 + work + drive_work - E1`, of either sign.
         """
         energy = lambda state: self.model.kinetic(state) + self.model.potential(state)
         account = self.account(energy(self.start) - energy(end), work, drive_work)
@@ -201,7 +202,7 @@ class StepProblem(eqx.Module):
         return eqx.tree_at(lambda account: account.dissipated, account, loss)
 
     def joint_rate(self, state: State) -> JointMultipliers:
-        """`psi(q, v)` where the formulation imposes it, else no rows."""
+        """`psi(q, v)` if the formulation imposes it, else an array of shape `(0,)`."""
         if self.formulation == "index3":
             return jnp.zeros((0,), state.q.dtype)
         return self.model.joint_rate(state.q, state.v, state.t)
@@ -212,7 +213,7 @@ class StepProblem(eqx.Module):
         return self.model.constraint_matrix(middle, self.middle_time)
 
     def rows(self, z: Increment, state: State, gradient: Gradient) -> Increment:
-        """The rows of one node: the structure residual, and the constraints there."""
+        """The equations of one node: those of motion, and the constraints at the node."""
         h = self.h
         balance, rates = self.model.structure(self.start, state, h, z.rate, gradient)
         return Increment(
@@ -223,10 +224,10 @@ class StepProblem(eqx.Module):
         )
 
     def rows_of_balance(self, balance: Coordinates, end: State) -> Increment:
-        """A balance of momentum, and the constraints at the end of the step.
+        """The equations of a step: `balance`, and the constraints at the end of the step.
 
-        For a problem that was made by `with_constant_inertia`; `balance` has the shape
-        `(nq,)` and is a momentum.
+        `balance` is a residual of the balance of momentum, shape `(nq,)` (momentum). The
+        problem must be one that `with_constant_inertia` has returned.
         """
         return Increment(
             impulse=self.model.constraint(end.q, end.t) / self.h,
@@ -236,7 +237,7 @@ class StepProblem(eqx.Module):
         )
 
     def guess(self, acceleration: Velocities, multipliers: Multipliers) -> Increment:
-        """The increment of a Taylor step of the whole length."""
+        """The increment of a Taylor expansion over the whole step."""
         q, v, h = self.start.q, self.start.v, self.h
         num_rates = jax.eval_shape(self.joint_rate, self.start).size
         return Increment(
@@ -248,17 +249,18 @@ class StepProblem(eqx.Module):
 
 
 class StepEnd(eqx.Module):
-    """What a solved step yields.
+    """The result of a solved step.
 
-    - `state`: at the end of the step, as the model has it.
-    - `displacement`: of the coordinates over the step, shape `(nq,)`, `h` times the rate
-      that was solved for. It is more exact than the difference of two rounded `q`.
+    - `state`: the model's state at the end of the step.
+    - `displacement`: the change of the coordinates, shape `(nq,)`, as `h` times the rate
+      that was solved for. It is more accurate than the difference of two rounded `q`.
     - `multipliers`: `lambda` of the step, shape `(nc,)`, joints first (energy per
       constraint unit).
-    - `energies`: the energy account.
-    - `details`: what the scheme reports of its own, or `None`.
-    - `result`: a failure that the scheme itself can see.
-    - `carried`: what a scheme with a memory hands to its next step; of others `None`.
+    - `energies`: the energy balance.
+    - `details`: further results of the scheme, or `None`.
+    - `result`: success, or a failure that the scheme detects.
+    - `carried`: the data that a scheme with a memory passes to its next step; `None` for
+      other schemes.
     """
 
     state: State
@@ -271,17 +273,17 @@ class StepEnd(eqx.Module):
 
 
 class AbstractScheme(eqx.Module):
-    """A one-step method: what `step` and `simulate` accept."""
+    """A time integration scheme, as `step` and `simulate` accept it."""
 
     @property
     @abc.abstractmethod
     def order(self) -> int:
-        """Order of accuracy in `q` and `v`, constrained or not."""
+        """The order of accuracy of `q` and `v`, with and without constraints."""
 
     @property
     @abc.abstractmethod
     def stages(self) -> tuple[float, ...]:
-        """The lengths of the solves that make up a step, as parts of `h`."""
+        """The lengths of the solves of which a step consists, as fractions of `h`."""
 
     @property
     @abc.abstractmethod
@@ -292,14 +294,15 @@ class AbstractScheme(eqx.Module):
 class AbstractOneSolveScheme(AbstractScheme, Generic[Z, P]):
     """A scheme whose step is one nonlinear solve: the base class for schemes of your own.
 
-    `Z` is a pytree of `Increment`s, one for each node of the step and that of the end of
-    the step last, and of the scheme's own scalar unknowns, which must be dimensionless.
-    `residual` returns the same structure, with rows in the places of the unknowns. `P` is
-    what is fixed in a step, a `StepProblem` or a module that contains one.
+    `Z` is the type of the unknowns: a pytree of one `Increment` for each node of the step,
+    that of the end of the step last, and of further scalar unknowns of the scheme, which
+    must be dimensionless. `residual` returns the same pytree with equations in place of the
+    unknowns. `P` is the type of the data of a step, a `StepProblem` or a module that
+    contains one.
 
     A subclass is an `equinox.Module` that defines `order`, `formulation`, `symmetric`,
-    `problem`, `predict`, `residual` and `finish`. It never solves: the step equations are
-    scaled, solved and differentiated by the run, for whichever scheme.
+    `problem`, `predict`, `residual` and `finish`. It does not solve its equations: they are
+    scaled, solved and differentiated in the same way for all schemes.
     """
 
     @property
@@ -326,7 +329,7 @@ class AbstractOneSolveScheme(AbstractScheme, Generic[Z, P]):
 
     @abc.abstractmethod
     def predict(self, problem: P, acceleration: Velocities, multipliers: Multipliers) -> Z:
-        """A first guess from the accelerations and multipliers at the start."""
+        """An initial guess from the accelerations and multipliers at the start."""
 
     @abc.abstractmethod
     def residual(self, z: Z, problem: P) -> Z:
@@ -338,31 +341,31 @@ class AbstractOneSolveScheme(AbstractScheme, Generic[Z, P]):
 
 
 class AbstractSchemeWithMemory(AbstractOneSolveScheme[Z, P], Generic[Z, P]):
-    """A scheme that remembers more of the last step than the state at its end.
+    """A scheme that passes more data from step to step than the state.
 
-    What it remembers is returned as `StepEnd.carried`, and is differentiated like the
-    state. Such a scheme is not a map from state to state, so it cannot be composed.
+    These data are returned as `StepEnd.carried` and are differentiated like the state. A
+    step of such a scheme is not a map from state to state, so it cannot be composed.
     """
 
     @abc.abstractmethod
     def begin(
         self, model: AbstractModel, start: State, h: Scalar, acceleration: Velocities
     ) -> PyTree[Any]:
-        """What is carried into the first step of a run."""
+        """The data that the first step of a run receives."""
 
     @abc.abstractmethod
     def resume(self, problem: P, carried: PyTree[Any]) -> P:
-        """The data of a step, with what the step before has carried into it."""
+        """The data of a step, including `carried`, the data from the step before."""
 
 
 class AbstractSchemeWithChord(AbstractOneSolveScheme[Z, P], Generic[Z, P]):
-    """A scheme whose equations can be solved nearly, by inertia and constraints alone.
+    """A scheme with an approximate Jacobian for the chord method.
 
-    The Jacobian of the step equations differs from the matrix of inertia and gradients of
-    the constraints by terms of the size `h^2` times stiffness over inertia. Where these are
-    small, a chord iteration with that matrix converges quickly, and its linear systems are
-    those of `B M^-1 B^T`: a search begins so, with constant inertia and `v = qdot`, and
-    goes on with the exact Jacobian where that fails.
+    The approximate Jacobian contains the inertia and the gradients of the constraints. It
+    differs from the exact one by terms of relative size `h^2` times stiffness divided by
+    inertia. Where these are small, the chord method with this matrix converges quickly, and
+    its linear systems have the matrix `B M^-1 B^T`. It is tried first for systems with
+    constant inertia and `v = qdot`. Where it fails, the exact Jacobian is used.
     """
 
     @abc.abstractmethod
@@ -371,4 +374,4 @@ class AbstractSchemeWithChord(AbstractOneSolveScheme[Z, P], Generic[Z, P]):
 
     @abc.abstractmethod
     def chord(self, rows: Z, problem: P, constraints: ConstraintMatrix) -> Z:
-        """The unknowns that the linearised step equations map to `rows`, nearly."""
+        """The unknowns `x` that solve `J x = rows` with the approximate Jacobian `J`."""

@@ -4,39 +4,39 @@ from .base import AbstractOneSolveScheme, AbstractScheme
 
 
 class Composed(AbstractScheme):
-    """A symmetric scheme raised to a higher order by steps of several lengths.
+    """A symmetric composition of a scheme, which has a higher order of accuracy.
 
-    A step is a palindrome of steps of lengths `stages[i] * h`, some of them backwards,
-    whose leading errors cancel. What every stage keeps, energy and constraints, the
-    composition keeps.
+    A step consists of stages, which are steps of lengths `stages[i] * h`, some of them
+    backwards. Their sequence is symmetric and their leading errors cancel. The composition
+    preserves what every stage preserves, such as the energy and the constraints.
 
     - Conserves, constraints held at: as the composed scheme.
-    - Order: `order`, 4, 6 or 8 (above that of the scheme).
-      Needs a smooth discrete gradient: where `V` is not quadratic the correction of
-      `Gonzalez()` spoils orders 6 and 8.
-    - Cost: one solve a stage. From order 2: 5, 9 and 17 stages for orders 4, 6 and 8; from
-      order 4 (`EnergyConsistent(0.0)`): 5 and 9 for orders 6 and 8.
-    - Takes driven constraints, but no `force`: a damper would feed energy in where a stage
-      goes backwards. Such a system raises a `ValueError`.
+    - Order: `order`, which is 4, 6 or 8 and above the order of the scheme. This requires a
+      smooth discrete gradient: where `V` is not quadratic, the correction of `Gonzalez()`
+      reduces orders 6 and 8.
+    - Cost: one solve per stage. From order 2: 5, 9 and 17 stages for orders 4, 6 and 8;
+      from order 4 (`EnergyConsistent(0.0)`): 5 and 9 for orders 6 and 8.
+    - Applies to systems with driven constraints, but not with a `force`, because a damper
+      would add energy in backward stages. Such a system raises a `ValueError`.
 
     **Arguments:**
 
-    - `scheme`: `EnergyPreserving()` or `EnergyConsistent(0.0)`; `Rattle()` to compare.
+    - `scheme`: `EnergyPreserving()` or `EnergyConsistent(0.0)`; for comparison `Rattle()`.
     - `order`: 4, 6 or 8.
 
-    Raises a `ValueError` for a scheme that is not symmetric (its backward stages would
-    feed energy in) and for an order that is not above that of the scheme.
+    Raises a `ValueError` for a scheme that is not symmetric, whose backward stages would
+    add energy, and for an order that is not above that of the scheme.
 
     **Reference:** order 4: M. Suzuki, Phys. Lett. A 146 (1990) 319-323; orders 6 and 8:
     W. Kahan and R.-C. Li, Math. Comp. 66 (1997) 1089-1099; see E. Hairer, C. Lubich and
     G. Wanner, Geometric Numerical Integration, section V.3. The nine stages from order 4 to
-    8 are this library's: they solve the conditions of order for a scheme of order 4,
-    with the smallest largest stage.
+    8 are new here: they solve the order conditions for a scheme of order 4, with the
+    longest stage as short as possible.
     """
 
     scheme: AbstractOneSolveScheme
-    # Static, and known when the composition is made: under a transformation the numbers
-    # of the scheme are traced, and whether alpha is 0 can no longer be seen.
+    # Static, and determined at construction. Under transformations of JAX the parameters of
+    # the scheme are traced, and whether alpha is zero is unknown.
     orders: tuple[int, int] = eqx.field(static=True)
 
     def __init__(self, scheme: AbstractOneSolveScheme, order: int):
@@ -70,17 +70,18 @@ class Composed(AbstractScheme):
 
 
 def _suzuki(order: int) -> tuple[float, float]:
-    """Five stages that raise the even order by two."""
+    """Five stages that raise an even order by two; the two before the middle one."""
     outer = 1 / (4 - 4 ** (1 / (order + 1)))
     return (outer, outer)
 
 
-# The stages before the middle one, by the order of the scheme and of the composition.
+# The stages before the middle one, for the order of the scheme and that of the composition.
 _HALVES = {
     (2, 4): _suzuki(2),
     (4, 6): _suzuki(4),
-    # sum g = 1, sum g^5 = sum g^7 = 0, and no [A, [A, E_5]] in the composed flow; of the
-    # one-parameter family the member with the smallest largest stage, 0.488.
+    # These satisfy sum g = 1 and sum g^5 = sum g^7 = 0, and the commutator [A, [A, E_5]]
+    # vanishes in the composed flow. Of the one-parameter family of solutions, this one has
+    # the shortest longest stage, 0.488.
     (4, 8): (
         0.32,
         0.258106154759961138878,

@@ -17,7 +17,7 @@ from ._dissipative_stiffness import dissipative_stiffness, DissipativeStiffness
 from .base import AbstractSchemeWithChord, Formulation, StepEnd, StepProblem
 
 
-# The end of the step; for large systems also the jump of the velocities.
+# The increment to the end of the step; for large systems also the jump of the velocities.
 _Unknowns: TypeAlias = Increment | JumpAndEnd
 
 
@@ -27,9 +27,9 @@ class _Problem(eqx.Module):
 
 
 class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
-    r"""One interval, order 4 or 3, and decay for any potential.
+    r"""Scheme of order 4 or 3 whose energy never grows, for any potential.
 
-    The jump `j` of the discontinuous schemes in closed form, so that the unknowns are
+    It has the jump `j` of the discontinuous schemes in closed form, so its unknowns are
     those of `EnergyPreserving`. With `z = (q, p)`, the symplectic matrix `J`, and
     `C = (Phi, psi)` with the multipliers `m = (lambda, eta)`:
 
@@ -38,35 +38,36 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
         E1      = E0 - alpha/2 j_P(alpha) . P j_P(alpha)
 
     `D = diag(K, M^-1)` with the stiffness `K = Hess(V + lambda . Phi)` at the midpoint
-    drives the order and does no work. `P = diag(K+, M^-1)` with the positive
-    semidefinite part of `K` (in the metric of the inertia, near the start of the step)
-    can only dissipate, whatever the potential is.
+    raises the order and does no work. `P = diag(K+, M^-1)`, with the positive semidefinite
+    part `K+` of `K` (in the metric of the inertia, near the start of the step), can only
+    dissipate, whatever the potential is.
 
     - Conserves: energy, to round-off, at `alpha = 0`.
     - Dissipates: `alpha/2 j . P j >= 0` in every step, also where `V` is not convex. On a
-      linear oscillator `rho_inf = (1 - alpha) / (1 + alpha)`. Where the stiffness has no
-      positive part there is nothing to damp, and nothing is removed. (Of a system with
-      more than 64 coordinates whose potential is linear or made of `Elements`, `P` is the
-      sum of the positive parts of its elements and constraints; of any other the whole
-      matrix is decomposed, at a cost that grows with its cube.)
+      linear oscillator `rho_inf = (1 - alpha) / (1 + alpha)`. Modes without positive
+      stiffness are not damped. (For a system with more than 64 coordinates whose potential
+      is linear or consists of `Elements`, `K+` is the sum of the positive parts of its
+      elements and constraints. For all others the eigenvalues of the whole matrix are
+      computed, at a cost that grows with the cube of its size.)
     - Constraints held at: position and velocity level.
-    - Order: 4 at `alpha = 0` (then symmetric: `Composed` raises it to 6 or 8), else 3;
-      2 where the `derivative` is no `MeanValue()` and `V` is not quadratic, and with
-      forces, which enter as in `EnergyPreserving`. Driven constraints keep the order.
-    - Needs canonical coordinates, `v = qdot` or momenta: with `kinematics` use
-      `EnergyPreserving` or `EnergyDecaying`.
+    - Order: 4 at `alpha = 0`, where the scheme is symmetric and `Composed` raises the order
+      to 6 or 8; else 3. The order is 2 with forces, which enter as in `EnergyPreserving`,
+      and where the `derivative` is not `MeanValue()` and `V` is not quadratic. Driven
+      constraints do not reduce the order.
+    - Requires `v = qdot` or momenta. For systems with `kinematics` use `EnergyPreserving`
+      or `EnergyDecaying`.
 
     **Arguments:**
 
-    - `alpha`: in [0, 1]; a traced leaf, free to be swept and differentiated.
-    - `derivative`: the discrete gradient; `MeanValue()` keeps the order.
+    - `alpha`: the dissipation, in [0, 1]. It can be traced, swept and differentiated.
+    - `derivative`: the discrete gradient; `MeanValue()` for the full order.
 
-    A concrete `alpha` outside [0, 1] raises a `ValueError`, and so does a system with
+    Raises a `ValueError` for a known `alpha` outside [0, 1] and for a system with
     `kinematics`.
 
     **Reference:** unconstrained at `alpha = 0` the fourth-order method of G. R. W. Quispel
     and D. I. McLaren, J. Phys. A 41 (2008) 045206, eq. (14); the dissipative and the
-    constrained forms are this library's. Neighbours: L. Brugnano, G. Gurioli,
+    constrained forms are new here. Related methods: L. Brugnano, G. Gurioli,
     F. Iavernaro and E. B. Weinmueller (2018), line-integral methods for holonomic
     constraints; P. L. Kinon, P. Betsch and S. Schneider (2023), energy-momentum schemes
     in Livens form; F. Armero and I. Romero (2001), energy-dissipating schemes.
@@ -74,21 +75,21 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
 
     alpha: Scalar
     derivative: AbstractDerivative
-    # Decided when the scheme is made: under a transformation `alpha` may be traced.
+    # Determined at construction: under transformations of JAX `alpha` may be traced.
     is_preserving: bool = eqx.field(static=True)
 
     def __init__(self, alpha: Real, derivative: AbstractDerivative = MeanValue(points=2)):
         check_derivative("EnergyConsistent", derivative)
         self.alpha = as_alpha(alpha)
         self.derivative = derivative
-        # In NumPy: under `jit` a comparison of JAX arrays would be traced.
+        # Compared in NumPy, because under `jit` a comparison of JAX arrays is traced.
         self.is_preserving = is_known(self.alpha) and not np.any(np.asarray(self.alpha))
 
     @classmethod
     def from_spectral_radius(
         cls, rho_inf: Real, derivative: AbstractDerivative = MeanValue(points=2)
     ) -> "EnergyConsistent":
-        """The scheme whose high-frequency limit is `rho_inf`, in [0, 1]."""
+        """The scheme with spectral radius `rho_inf`, in [0, 1], at infinite frequency."""
         return cls(alpha=alpha_from_spectral_radius(rho_inf), derivative=derivative)
 
     @property
@@ -147,7 +148,7 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
     ) -> _Unknowns:
         if not isinstance(rows, JumpAndEnd):
             return step_chord(rows, constraints)
-        # The jump of the velocities is an unknown too, which lowers those at the end.
+        # The velocities at the end of the step are reduced by the unknown jump.
         jump = constraints.inverse_inertia @ rows.jump.rate
         end = eqx.tree_at(
             lambda end: (end.rate, end.velocity_impulse),
@@ -187,7 +188,7 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
         gradient = step.discrete_gradient(step.start, end, z)
         gradient = gradient.less(step.step_load(end, z))
         skew = self._skew_gradient(z, step, end)
-        # What `(j(alpha) - j(0))/2`, with P, adds to both parts of the gradient.
+        # The terms of `P (j(alpha) - j(0))/2` in both components of the gradient.
         force = h**2 / 12 * self._alpha(h) * (dissipative.matrix @ jump_v)
         undamped = dissipative.inverse_inertia @ (dissipative.matrix @ (h**2 / 6 * z.rate))
         rate = step.model.momentum_rows(0.5 * (jump_v - undamped))
@@ -211,7 +212,7 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
                 self._middle(z, step, start.v), z.impulse / h, (dq, step.duration)
             )
             force = h / 6 * (curvature - dissipative.matrix @ dq)
-            # The row S_mu, solved for v1 - v0. The jump depends on this change itself.
+            # The row S_mu, solved for v1 - v0. The jump depends on v1 - v0 too.
             right = 2 * (z.rate - start.v) - (at_start + at_end)
             right = right - dissipative.inverse_inertia @ force
             if jump_v is not None:
@@ -231,7 +232,7 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
         return step.model.velocity_change(change, dissipative.inverse_inertia)
 
     def _skew_gradient(self, z: Increment, step: StepProblem, end: State) -> Gradient:
-        """`D J D (z1 - z0)` at the midpoint, `h` times in the first part."""
+        """`D J D (z1 - z0)` at the midpoint; the rows of the coordinates times `h`."""
         dv = end.v - step.start.v
         middle = self._middle(z, step, step.start.v + 0.5 * dv)
         change = (step.h * z.rate, dv, step.duration)

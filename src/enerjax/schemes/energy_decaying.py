@@ -24,9 +24,9 @@ from .base import AbstractSchemeWithChord, Formulation, StepEnd, StepProblem
 
 
 class EnergyDecaying(AbstractSchemeWithChord[JumpAndEnd, StepProblem]):
-    """Discontinuous Galerkin scheme: the energy decays by `alpha` times a jump.
+    """Discontinuous Galerkin scheme, whose energy decays by `alpha` times that of a jump.
 
-    The state jumps from `z0` to `zj` at the start of the step and moves on to `z1`:
+    The state jumps from `z0` to `zj` at the start of the step and then moves to `z1`:
 
         S(z0, z1, DH_g) = 0,                   g the interval zj -> z1
         S(z0, zj, -(DH_g - DH_h)/3 + alpha/6 (grad H(zj) - grad H(z0))) = 0
@@ -37,23 +37,23 @@ class EnergyDecaying(AbstractSchemeWithChord[JumpAndEnd, StepProblem]):
       `V_jump = (qj - q0) . (grad V(qj) - grad V(q0)) / 2`, which is never negative where
       `V` is convex over the jump. (With a Hamiltonian their sum is
       `(zj - z0) . (grad H(zj) - grad H(z0)) / 2`, and `H` must be convex.) On a linear
-      oscillator of frequency `w` the step tends to `rho_inf = (1 - alpha) / (1 + alpha)`
-      as `h w` grows. Forces enter the intervals like `-grad V`; a damper `-C v` with
-      constant `C` never creates energy.
+      oscillator of frequency `w` the spectral radius of a step tends to
+      `rho_inf = (1 - alpha) / (1 + alpha)` as `h w` grows. Forces enter the intervals like
+      `-grad V`; a damper `-C v` with constant `C` never creates energy.
     - Constraints held at: position level at `zj` and `z1`; with `formulation="ggl"`
       velocity level too.
-    - Order: 2. Unconstrained with `v = qdot`, 3 with `MeanValue()` or one coordinate, and
-      with linear dampers, but not with other forces.
-      `"index3"` is the paper's: on constrained motion it tends to order 1, *locks* at
-      `alpha = 0` and dissipates far too much above.
+    - Order: 2. For unconstrained systems with `v = qdot` it is 3 with `MeanValue()` or with
+      one coordinate, also with linear dampers, but not with other forces. `"index3"` is the
+      form of the paper: with constraints its order tends to 1, it *locks* at `alpha = 0`,
+      and it dissipates far too much at larger `alpha`.
 
     **Arguments:**
 
-    - `alpha`: in [0, 1]; a traced leaf, free to be swept and differentiated.
+    - `alpha`: the dissipation, in [0, 1]. It can be traced, swept and differentiated.
     - `formulation`: `"ggl"` or `"index3"`.
     - `derivative`: the discrete gradient.
 
-    A concrete `alpha` outside [0, 1] raises a `ValueError`.
+    Raises a `ValueError` for a known `alpha` outside [0, 1].
 
     **Reference:** E. Lens and A. Cardona, sections 5.1 (alpha = 1, eq. 28) and 5.2
     (eq. 47).
@@ -76,7 +76,7 @@ class EnergyDecaying(AbstractSchemeWithChord[JumpAndEnd, StepProblem]):
         formulation: Formulation = "ggl",
         derivative: AbstractDerivative = ChainRule(),
     ) -> "EnergyDecaying":
-        """The scheme whose high-frequency limit is `rho_inf`, in [0, 1]."""
+        """The scheme with spectral radius `rho_inf`, in [0, 1], at infinite frequency."""
         alpha = alpha_from_spectral_radius(rho_inf)
         return cls(alpha=alpha, formulation=formulation, derivative=derivative)
 
@@ -133,7 +133,7 @@ class EnergyDecaying(AbstractSchemeWithChord[JumpAndEnd, StepProblem]):
         )
 
     def _nodes(self, z: JumpAndEnd, problem: StepProblem) -> tuple[State, ...]:
-        """The nodes after the jump, which takes no time, and at the end."""
+        """The states after the jump, which takes no time, and at the end."""
         model, start = problem.model, problem.start
         qj, q1 = problem.position(z.jump), problem.position(z.end)
         t0, t1 = start.t, problem.end_time

@@ -11,21 +11,21 @@ from .base import AbstractSchemeWithChord, Formulation, StepEnd, StepProblem
 
 
 class EnergyPreserving(AbstractSchemeWithChord[Increment, StepProblem]):
-    """Continuous Galerkin scheme: keeps the total energy, damps nothing.
+    """Continuous Galerkin scheme, which preserves the total energy.
 
     Solves `S(z0, z1, DH(z0, z1)) = 0` with the constraints at the end of the step.
 
-    - Conserves: energy, to round-off, at any step. With forces and driven constraints it
-      changes by their work. Forces act in the middle of the step, at the velocity
-      `Lm (q1 - q0)/h`, so a damper never creates energy.
-    - Dissipates: nothing, high-frequency noise included.
+    - Conserves: energy, to round-off, for any step length. With forces and driven
+      constraints the energy changes by their work. Forces act in the middle of the step, at
+      the velocity `Lm (q1 - q0)/h`, so a damper never creates energy.
+    - Dissipates: nothing, not even high-frequency oscillations.
     - Constraints held at: position level; with `formulation="ggl"` velocity level too.
     - Order: 2. Symmetric: `Composed` raises the order to 4, 6 or 8.
 
     **Arguments:**
 
-    - `formulation`: `"ggl"` (velocity-level constraints with their own multipliers) or
-      `"index3"` (the paper's; velocity constraints are then met to second order).
+    - `formulation`: `"ggl"` (velocity-level constraints have multipliers of their own) or
+      `"index3"` (as in the paper; velocities satisfy the constraints to second order).
     - `derivative`: the discrete gradient.
 
     **Reference:** E. Lens and A. Cardona, section 4.1, eq. (14). The `"ggl"` form adds

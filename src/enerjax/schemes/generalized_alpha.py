@@ -12,9 +12,9 @@ from .base import AbstractSchemeWithMemory, Formulation, StepEnd, StepProblem
 
 
 class _Carried(eqx.Module):
-    # a_n, which stands for the acceleration at t_n + (alpha_m - alpha_f) h.
+    # a_n, which approximates the acceleration at t_n + (alpha_m - alpha_f) h.
     auxiliary: Velocities
-    # vdot_n, in balance at t_n.
+    # vdot_n, which satisfies the equations of motion at t_n.
     acceleration: Velocities
 
 
@@ -26,8 +26,9 @@ class _AlphaProblem(eqx.Module):
 class GeneralizedAlpha(AbstractSchemeWithMemory[Increment, _AlphaProblem]):
     """The generalized-alpha method for index-3 systems; for comparison.
 
-    An auxiliary acceleration `a`, carried from step to step, drives positions and
-    velocities; the true one is in balance at the end of the step:
+    Positions and velocities are computed from an auxiliary acceleration `a`, which is
+    passed from step to step. The acceleration `vdot` satisfies the equations of motion at
+    the end of the step:
 
         M vdot1 + dV/dq(q1) + B1^T lambda1 = f(q1, v1, t1),      Phi(q1) = 0
         (1 - alpha_m) a1 + alpha_m a0 = (1 - alpha_f) vdot1 + alpha_f vdot0
@@ -35,25 +36,25 @@ class GeneralizedAlpha(AbstractSchemeWithMemory[Increment, _AlphaProblem]):
         v1 = v0 + h ((1 - gamma) a0 + gamma a1)
 
     - Conserves: nothing exactly.
-    - Dissipates: high frequencies, by the factor `rho_inf` a step where they are infinite.
-      It has no energy identity: `dissipated` is the measured loss
-      `E0 + work + drive_work - E1` of the step, of either sign; work is that of forces and
-      reactions at both ends, by the trapezoidal rule.
+    - Dissipates: high-frequency oscillations; a step multiplies the amplitude of an
+      infinitely fast one by `rho_inf`. The scheme has no energy identity: `dissipated` is
+      the measured loss `E0 + work + drive_work - E1` of the step, of either sign. The work
+      of forces and reactions is computed by the trapezoidal rule.
     - Constraints held at: position level; with `formulation="ggl"` velocity level too, by
-      `- h M^-1 B0^T eta` in the line of `q1`.
-    - Order: 2, in the multipliers too, once the first steps have decayed: a run begins
-      with `a0 = vdot0`. That needs `rho_inf < 1` where there are constraints: at 1 (and
-      for `newmark`) what a step leaves in the multipliers does not decay.
+      the term `- h M^-1 B0^T eta` in the equation of `q1`.
+    - Order: 2, also of the multipliers. A run begins with `a0 = vdot0`, and the error of
+      this start has to decay first. With constraints this requires `rho_inf < 1`: at 1
+      (and for `newmark`) errors of the multipliers do not decay.
     - Multipliers: `lambda1`, those at the end of the step.
     - For a `System` without `kinematics`. Others raise a `ValueError`.
-    - `step` without `warm` begins anew.
+    - `step` without `warm` begins again with `a0 = vdot0`.
 
     **Arguments:**
 
-    - `rho_inf`: the spectral radius at infinite frequency, in [0, 1]; traced.
+    - `rho_inf`: the spectral radius at infinite frequency, in [0, 1]. It can be traced.
     - `formulation`: `"index3"` or `"ggl"`.
 
-    **Raises:** `ValueError` for a concrete `rho_inf` outside [0, 1].
+    **Raises:** `ValueError` for a known `rho_inf` outside [0, 1].
 
     **Reference:** J. Chung and G. M. Hulbert, J. Appl. Mech. 60 (1993) 371-375, for the
     coefficients; M. Arnold and O. Bruls, Multibody Syst. Dyn. 18 (2007) 185-202, for the
@@ -71,7 +72,7 @@ class GeneralizedAlpha(AbstractSchemeWithMemory[Increment, _AlphaProblem]):
 
     def __init__(self, rho_inf: Real, formulation: Formulation = "index3"):
         check_formulation("GeneralizedAlpha", formulation)
-        # With this alpha the four coefficients are polynomials.
+        # In terms of this alpha the four coefficients are polynomials.
         alpha = alpha_from_spectral_radius(rho_inf)
         self.alpha_m = 0.5 * (1 - 3 * alpha)
         self.alpha_f = 0.5 * (1 - alpha)
@@ -85,7 +86,7 @@ class GeneralizedAlpha(AbstractSchemeWithMemory[Increment, _AlphaProblem]):
     ) -> "GeneralizedAlpha":
         """The method of Hilber, Hughes and Taylor, `alpha` in [-1/3, 0].
 
-        **Raises:** `ValueError` for a concrete `alpha` outside.
+        **Raises:** `ValueError` for a known `alpha` outside this interval.
 
         **Reference:** H. M. Hilber, T. J. R. Hughes and R. L. Taylor, Earthq. Eng. Struct.
         Dyn. 5 (1977) 283-292.
@@ -103,9 +104,9 @@ class GeneralizedAlpha(AbstractSchemeWithMemory[Increment, _AlphaProblem]):
     def newmark(
         cls, beta: Real = 0.25, gamma: Real = 0.5, formulation: Formulation = "index3"
     ) -> "GeneralizedAlpha":
-        """The method of Newmark; of order 2 with `gamma = 1/2` alone.
+        """The method of Newmark; it is of order 2 only with `gamma = 1/2`.
 
-        **Raises:** `ValueError` for a concrete `beta` that is not positive.
+        **Raises:** `ValueError` for a known `beta` that is not positive.
 
         **Reference:** N. M. Newmark, J. Eng. Mech. Div. 85 (1959) 67-94.
         """
@@ -174,7 +175,8 @@ class GeneralizedAlpha(AbstractSchemeWithMemory[Increment, _AlphaProblem]):
         work = lambda law: half * sum(powers(law))
         drive_work = None
         if model.system.driven is not None:
-            # The reactions are what keeps the balance; those of joints at rest do no work.
+            # The reactions follow from the equations of motion. Those of scleronomic joints
+            # do no work.
             power = lambda x, vdot: (model.inertia @ vdot + model.slope(x)) @ x.v
             first, last = before.acceleration, after.acceleration
             drive_work = half * (power(step.start, first) + power(end, last))
@@ -187,7 +189,7 @@ class GeneralizedAlpha(AbstractSchemeWithMemory[Increment, _AlphaProblem]):
         )
 
     def _end(self, z: Increment, problem: _AlphaProblem) -> tuple[State, _Carried]:
-        """The state at the end, and the accelerations that lead there."""
+        """The state and the accelerations at the end of the step."""
         step, before = problem.step, problem.before
         assert before is not None
         start, h = step.start, step.h

@@ -23,22 +23,23 @@ from .base import AbstractOneSolveScheme, Formulation, StepEnd, StepProblem
 
 class _Unknowns(eqx.Module):
     nodes: JumpAndEnd
-    # One entry, or none without joints: kappa is then 1 by construction.
+    # Shape `(1,)`; `(0,)` for systems without joints, for which kappa is 1.
     kappa: Float[Array, " nk"]
 
 
 class KappaDecaying(AbstractOneSolveScheme[_Unknowns, StepProblem]):
-    """The paper's decaying scheme with velocity constraints and the parameter kappa.
+    """The energy-decaying scheme of the paper with velocity constraints and `kappa`.
 
-    Like `EnergyDecaying`, but with the velocity-level multipliers interpolated between
-    the nodes, and a factor `kappa` on the velocities that restores the energy identity
+    It differs from `EnergyDecaying` in the velocity-level multipliers, which are
+    interpolated between the nodes, and in a factor `kappa` on the velocities, which
+    restores the energy identity
 
         E1 = E0 - alpha (kappa K_jump + V_jump).
 
     `kappa - 1` is the work of the velocity-level multipliers divided by the change of
     kinetic energy in the step, so the scheme fails wherever that change passes through
-    zero: in every oscillation of a system with more than one degree of freedom. It is
-    here to reproduce the paper; prefer `EnergyDecaying` or `EnergyConsistent`.
+    zero, as in every oscillation of a system with more than one degree of freedom. It is
+    included to reproduce the paper; prefer `EnergyDecaying` or `EnergyConsistent`.
 
     - Conserves: energy, to round-off, at `alpha = 0`.
     - Dissipates: `alpha (kappa K_jump + V_jump)`.
@@ -48,10 +49,10 @@ class KappaDecaying(AbstractOneSolveScheme[_Unknowns, StepProblem]):
 
     **Arguments:**
 
-    - `alpha`: in [0, 1]; a traced leaf.
+    - `alpha`: the dissipation, in [0, 1]. It can be traced, swept and differentiated.
     - `derivative`: the discrete gradient.
 
-    A concrete `alpha` outside [0, 1] raises a `ValueError`.
+    Raises a `ValueError` for a known `alpha` outside [0, 1].
 
     **Reference:** E. Lens and A. Cardona, section 5.3, eq. (66) to (71).
     """
@@ -94,8 +95,8 @@ class KappaDecaying(AbstractOneSolveScheme[_Unknowns, StepProblem]):
         after, before = after.less(loads.after), before.less(loads.before)
         at_start = model.gradient(start, h).less(loads.start)
         at_jump = model.gradient(jump, h).less(loads.jump)
-        # Where momenta are unknowns, the reactions are a part of the rows; else they are a
-        # part of the velocities.
+        # Where momenta are unknowns, the reactions are terms of the rows. Otherwise they
+        # are terms of the velocities.
         reaction_jump = model.reaction_row(jump, nodes.jump.velocity_impulse)
         reaction_end = model.reaction_row(end, nodes.end.velocity_impulse)
         to_end = _scaled(kappa, after, 0.5 * (reaction_jump + reaction_end))
@@ -121,7 +122,7 @@ class KappaDecaying(AbstractOneSolveScheme[_Unknowns, StepProblem]):
         dissipated = self.alpha.astype(kappa.dtype) * (kappa * kinetic + potential)
         work = jump_work(self.alpha, z.nodes, problem, jump, end)
         drive_work = problem.drive_work(jump, end, _position_level(z.nodes.end))
-        # A kappa without value comes from an iterate that broke down for other reasons.
+        # A non-finite kappa means that the iteration has failed for another reason.
         bounded = ((kappa > 0) & (kappa < 2)) | ~jnp.isfinite(kappa)
         return StepEnd(
             state=end,
@@ -141,7 +142,7 @@ class KappaDecaying(AbstractOneSolveScheme[_Unknowns, StepProblem]):
         after: Gradient,
         before: Gradient,
     ) -> Float[Array, " nk"]:
-        """eq. (70, 71), multiplied out, over an energy of the step."""
+        """Eq. (70, 71), multiplied out and divided by the energy scale of the step."""
         if z.kappa.size == 0:
             return z.kappa
         model, start = problem.model, problem.start
@@ -158,7 +159,7 @@ class KappaDecaying(AbstractOneSolveScheme[_Unknowns, StepProblem]):
         return ((z.kappa - 1) * change + 0.5 * work) / scale
 
     def _nodes(self, z: _Unknowns, problem: StepProblem) -> tuple[State, ...]:
-        """The nodes after the jump, which takes no time, and at the end."""
+        """The states after the jump, which takes no time, and at the end."""
         model, start, kappa = problem.model, problem.start, _kappa(z)
         jump, end = z.nodes.jump, z.nodes.end
         qj, q1 = problem.position(jump), problem.position(end)
@@ -180,12 +181,12 @@ def _kappa(z: _Unknowns) -> Scalar:
 
 
 def _position_level(increment: Increment) -> Increment:
-    """Without the velocity-level multipliers, which do not enter the balance of momentum
-    in this scheme."""
+    """The increment without its velocity-level multipliers, which do not enter the balance
+    of momentum in this scheme."""
     eta = increment.velocity_impulse
     return eqx.tree_at(lambda z: z.velocity_impulse, increment, eta[:0])
 
 
 def _scaled(kappa: Scalar, gradient: Gradient, reaction: Velocities | float = 0.0):
-    """A gradient with `kappa` times its rate, and a reaction added to that."""
+    """The gradient with the rate `kappa * gradient.rate + reaction`."""
     return Gradient(gradient.impulse, kappa * gradient.rate + reaction)

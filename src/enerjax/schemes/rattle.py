@@ -7,23 +7,23 @@ from .base import AbstractOneSolveScheme, Formulation, StepEnd, StepProblem
 
 
 class Rattle(AbstractOneSolveScheme[Increment, StepProblem]):
-    """RATTLE: the leapfrog (Stormer-Verlet) scheme on the constraints; for comparison.
+    """RATTLE: the constrained leapfrog (Stormer-Verlet) scheme; for comparison.
 
-    With `V` for velocities half-way and `F = -dV/dq + f`,
+    With the velocity `V` in the middle of the step and the forces `F = -grad V + f`,
 
         M V  = M v0 + h/2 (F(q0, V) - B0^T lambda0),    q1 = q0 + h V,    Phi(q1) = 0
         M v1 = M V  + h/2 (F(q1, V) - B1^T lambda1),                      B1 v1 = 0
 
-    - Conserves: the symplectic form, and linear and angular momentum. The energy
-      oscillates with `h^2` and does not drift, at steps short enough for the fastest
-      motion: the forces are explicit, so `h` times a frequency must stay below 2.
+    - Conserves: the symplectic form, and linear and angular momentum. The energy error
+      oscillates with an amplitude of order `h^2` and does not drift. The forces are
+      explicit, so the step must be short: `h` times any frequency must be below 2.
     - Dissipates: nothing. It has no energy identity: `dissipated` is the measured loss
       `E0 + work + drive_work - E1` of the step, of either sign.
     - Constraints held at: position and velocity level.
     - Order: 2. Symmetric: `Composed` raises the order to 4, 6 or 8.
     - Multipliers: `(lambda0 + lambda1)/2`, the mean over the step.
-    - For a `System` without `kinematics`; `force` may depend on the velocity, and enters
-      at both ends with `V`. Others raise a `ValueError`.
+    - For a `System` without `kinematics`. Others raise a `ValueError`. A `force` may depend
+      on the velocity; it is evaluated with `V` at both ends.
 
     **Reference:** H. C. Andersen, J. Comput. Phys. 52 (1983) 24-34; the form with general
     constraints and its symplecticity: B. Leimkuhler and R. D. Skeel, J. Comput. Phys. 112
@@ -49,7 +49,7 @@ class Rattle(AbstractOneSolveScheme[Increment, StepProblem]):
     def predict(
         self, problem: StepProblem, acceleration: Velocities, multipliers: Multipliers
     ) -> Increment:
-        """The velocity half-way, `h lambda0` and, as velocity impulse, `h lambda1`."""
+        """`rate` is `V`, `impulse` is `h lambda0`, `velocity_impulse` is `h lambda1`."""
         guess = problem.guess(acceleration, multipliers)
         return eqx.tree_at(lambda z: z.velocity_impulse, guess, guess.impulse)
 
@@ -92,7 +92,7 @@ class Rattle(AbstractOneSolveScheme[Increment, StepProblem]):
         return problem.h * slope + model.constraint_force(q, t, impulse)
 
     def _drive_work(self, z: Increment, problem: StepProblem, end: State) -> Scalar | None:
-        """The work of all reactions, because those of joints at rest do none."""
+        """The work of all reactions; those of scleronomic joints do no work."""
         model, start = problem.model, problem.start
         if model.system.driven is None:
             return None

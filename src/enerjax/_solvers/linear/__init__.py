@@ -1,1 +1,1 @@
-"""Factorisations and Jacobians: small and dense, banded, in blocks, by a given solver."""
+"""Jacobians and factorisations: dense, banded, block-diagonal, or by a user's solver."""

@@ -1,4 +1,4 @@
-"""Symmetric matrices that are assembled from small ones: the stiffness of many elements."""
+"""Symmetric matrices that are assembled from element matrices, such as the stiffness."""
 
 from collections.abc import Callable
 
@@ -12,35 +12,38 @@ from .jacobian import RowPattern
 
 
 class ElementMatrices(eqx.Module):
-    """Small matrices of one size, and the rows (and columns) of the whole where each is
-    added."""
+    """Element matrices of equal size, and the rows (and columns) of the assembled matrix
+    to which each is added."""
 
     rows: Indices = eqx.field(static=True)
     blocks: Float[Array, "elements width width"]
 
 
 class Assembled(eqx.Module):
-    """The sum of what the elements add. Takes the place of an array in products with
-    vectors."""
+    """A matrix that is the sum of element matrices, for products with vectors only."""
 
-    parts: tuple[ElementMatrices, ...]
+    groups: tuple[ElementMatrices, ...]
 
     def __matmul__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         out = jnp.zeros_like(x)
-        for part in self.parts:
-            rows = part.rows.array
-            products = jnp.sum(part.blocks * x[rows][:, None, :], axis=-1)
+        for group in self.groups:
+            rows = group.rows.array
+            products = jnp.sum(group.blocks * x[rows][:, None, :], axis=-1)
             out = out.at[rows].add(products)
         return out
 
     def map(self, fn: Callable[[Array, np.ndarray], Array]) -> "Assembled":
-        """With `fn(blocks, rows)` in the place of the blocks."""
-        changed = [fn(part.blocks, part.rows.array) for part in self.parts]
-        return Assembled(tuple(map(ElementMatrices, [p.rows for p in self.parts], changed)))
+        """The matrix assembled from `fn(blocks, rows)` in place of the blocks."""
+        return Assembled(
+            tuple(
+                ElementMatrices(group.rows, fn(group.blocks, group.rows.array))
+                for group in self.groups
+            )
+        )
 
 
 def row_hessians(fn: Callable[[Array], Array], x: Float[Array, " n"]) -> ElementMatrices:
-    """The Hessian of each row of `fn`, on the unknowns that the row depends on."""
+    """The Hessian of each entry of `fn` with respect to the unknowns it depends on."""
     pattern = RowPattern(fn, x)
     gradients = lambda x: pattern.derivative(fn, x)
     return ElementMatrices(Indices(pattern.columns), pattern.derivative(gradients, x))

@@ -1,10 +1,11 @@
-"""Large sparse Jacobians: coloured columns, a narrow band, a block elimination.
+"""Large sparse Jacobians as block tridiagonal matrices, and their elimination.
 
-The unknowns are numbered by reverse Cuthill-McKee (E. Cuthill and J. McKee, 1969), which
-makes the Jacobian of chains, trees and most mechanisms a narrow band. Cut into blocks it
-is block tridiagonal, and is eliminated block by block, with row pivoting over each pair of
-neighbours, which is all that the blocks leave to choose from. All of it is written in JAX,
-so batches, accelerators and derivatives work.
+The unknowns are numbered by the reverse Cuthill-McKee algorithm (E. Cuthill and J. McKee,
+1969), which makes the Jacobian of chains, trees and typical mechanisms a narrow band.
+Divided into blocks it is block tridiagonal. It is eliminated block by block, with row
+pivoting among the rows of two neighbouring blocks; the other rows are zero there. Columns
+of the Jacobian that share no row have the same colour and are evaluated in one product.
+Everything is written in JAX, so it works in batches, on accelerators and with derivatives.
 """
 
 from collections.abc import Callable
@@ -20,21 +21,22 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from ..._programs import columns_along, in_one_function, shape_of
 from .dense import AbstractFactors
-from .elimination import LIBRARY, pivot_rows_first, reduced
+from .elimination import apply_reduction, eliminate_columns, LAPACK_FROM
 
 
 class Band:
-    """How a sparse matrix is stored as a band of blocks. Made while a program is traced.
+    """The index tables by which a sparse matrix is stored as a block tridiagonal one.
 
-    All blocks have the `width` of the largest; what the others lack are unknowns of no
-    other row, which are zero.
+    The tables are constructed at trace time. All blocks have the `width` of the largest
+    one. Smaller blocks are padded with decoupled unknowns, whose equation is `x = 0`.
 
-    - `colours`: of each column; columns of a colour share no row.
-    - `places`: for the entries `(block, row, 3 * width)` of the band, where they stand in
-      the coloured products; beyond the last of them where they are zero.
-    - `order`: the numbers of the unknowns along the band; the size where one is lacking.
-    - `back`: where each unknown stands along the band.
-    - `filling`: the ones on the diagonal where one is lacking.
+    - `colours`: the colour of each column. Columns of equal colour share no row.
+    - `places`: the index of each entry `(block, row, 3 * width)` of the band in the
+      coloured products; for entries that are zero, the number of these products.
+    - `order`: the number of the unknown at each position of the band; the size of the
+      matrix at padded positions.
+    - `back`: the position of each unknown in the band.
+    - `padding`: ones on the diagonal at padded positions, shape as `places`.
     """
 
     def __init__(self, pattern: csr_array):
@@ -45,7 +47,7 @@ class Band:
         self.width = width = int(sizes.max(initial=1))
         self.num_blocks = blocks = sizes.size
         self.size = size
-        # What stands where along the band.
+        # The positions of the unknowns in the band.
         starts = np.cumsum(sizes) - sizes
         number = np.repeat(np.arange(blocks), sizes)
         self.back = back = np.empty(size, int)
@@ -60,22 +62,22 @@ class Band:
         nowhere = self.num_colours * size
         self.places = np.full((blocks, width, 3 * width), nowhere)
         self.places[block, row, column] = rows * self.num_colours + self.colours[columns]
-        self.filling = np.zeros(self.places.shape)
+        self.padding = np.zeros(self.places.shape)
         block, row = np.divmod(np.flatnonzero(self.order == size), width)
-        self.filling[block, row, width + row] = 1
+        self.padding[block, row, width + row] = 1
 
-    def worth_it(self) -> bool:
-        """Whether its elimination is less work than that of the dense matrix."""
-        part = 40 if self.width < LIBRARY else 8
-        return part * self.num_blocks * self.width**3 < self.size**3
+    def is_cheaper_than_dense(self) -> bool:
+        """Whether the block elimination needs less work than that of the dense matrix."""
+        cost = 40 if self.width < LAPACK_FROM else 8
+        return cost * self.num_blocks * self.width**3 < self.size**3
 
     def empty(self, size: int, dtype: Any) -> "BandFactors":
-        """Factors of no matrix yet."""
+        """Placeholder factors, of the shapes that `renewed` returns."""
         del size
         blocks, width = self.num_blocks, self.width
         shapes = (2 * width, width), (width, 2 * width)
-        turns, upper = (jnp.zeros((blocks, *shape), dtype) for shape in shapes)
-        return BandFactors(self, turns, jnp.zeros((blocks, 2 * width), int), upper)
+        reductions, upper = (jnp.zeros((blocks, *shape), dtype) for shape in shapes)
+        return BandFactors(self, reductions, jnp.zeros((blocks, 2 * width), int), upper)
 
     def evaluate(
         self, fn: Callable[[Array], Array], x: Float[Array, " n"]
@@ -83,20 +85,21 @@ class Band:
         """The band of the Jacobian of `fn` at `x`."""
         products = coloured_products(fn, x, self.colours)
         entries = jnp.append(products.ravel(), 0)
-        return entries[self.places] + jnp.asarray(self.filling, x.dtype)
+        return entries[self.places] + jnp.asarray(self.padding, x.dtype)
 
 
 def block_sizes(pattern: csr_array) -> np.ndarray:
-    """Sizes of blocks along a symmetric band, such that only neighbours touch.
+    """The sizes of blocks that make a symmetric banded matrix block tridiagonal.
 
-    From that of the first one follow all others, at their smallest; together, up to the
-    largest of them, they are fewer. Those with the least work.
+    The size of the first block determines the smallest possible sizes of all others.
+    Consecutive blocks are merged while they do not exceed the largest block. Of all sizes
+    of the first block, the one with the least work is chosen.
     """
     size, _ = shape_of(pattern)
     rows, columns = pattern.nonzero()
     reach = np.arange(size)
     np.maximum.at(reach, rows, columns)
-    # Behind the last unknown that one up to here touches.
+    # One more than the last unknown that is coupled to this or an earlier unknown.
     ends = np.maximum.accumulate(reach) + 1
     candidates = []
     for first in range(1, int(ends[:1].max(initial=1)) + 1):
@@ -117,13 +120,16 @@ def block_sizes(pattern: csr_array) -> np.ndarray:
 def coloured_products(
     fn: Callable[[Array], Array], x: Float[Array, " n"], colours: np.ndarray
 ) -> Float[Array, "m ... colours"]:
-    """For each colour the sum of the columns that have it."""
+    """For each colour, the sum of the columns of the Jacobian that have this colour."""
     numbers = np.arange(int(colours.max(initial=0)) + 1)
     return columns_along(fn, x, colours[:, None] == numbers)
 
 
 def column_colours(pattern: csr_array, order: np.ndarray) -> np.ndarray:
-    """Greedy, along the band: the first colour that no column of a shared row has."""
+    """Colours of the columns, such that columns of equal colour share no row.
+
+    Greedy: in the given `order`, each column gets the first colour that is still free.
+    """
     by_column = pattern.tocsc()
     num_rows, num_columns = shape_of(pattern)
     seen: list[set[int]] = [set() for _ in range(num_rows)]
@@ -139,16 +145,16 @@ def column_colours(pattern: csr_array, order: np.ndarray) -> np.ndarray:
 
 
 class BandFactors(AbstractFactors):
-    """An eliminated band.
+    """The factors of a block tridiagonal matrix.
 
-    - `turns`, `orders`: for each block, what takes the rows left over and those of the next
-      block to the pivot rows, solved for their own unknowns, and to those left over; see
-      `pivot_rows_first`.
-    - `upper`: the pivot rows in the unknowns of the next two blocks.
+    - `reductions`, `orders`: for each block, the elimination of its unknowns from the rows
+      that remain of the block before and from the rows of the next block; see
+      `eliminate_columns`.
+    - `upper`: the entries of the pivot rows of each block in the next two blocks.
     """
 
     band: Band = eqx.field(static=True)
-    turns: Float[Array, "blocks two_widths width"]
+    reductions: Float[Array, "blocks two_widths width"]
     orders: Int[Array, "blocks two_widths"]
     upper: Float[Array, "blocks width two_widths"]
 
@@ -157,19 +163,19 @@ class BandFactors(AbstractFactors):
 
     def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
         band = self.band
-        filled = jnp.append(right, 0)[band.order].reshape(band.num_blocks, band.width)
+        padded = jnp.append(right, 0)[band.order].reshape(band.num_blocks, band.width)
         substituted = in_one_function(_substituted)
-        x = substituted(self.turns, self.orders, self.upper, filled)
+        x = substituted(self.reductions, self.orders, self.upper, padded)
         return x.ravel()[band.back]
 
 
 def _eliminated(
     matrix: Float[Array, "blocks width three_widths"],
 ) -> tuple[Array, Array, Array]:
-    """The `turns`, the `orders` and the `upper` rows of `BandFactors`."""
+    """The `reductions`, the `orders` and the `upper` rows of `BandFactors`."""
     width = matrix.shape[1]
     none = jnp.zeros((width, width), matrix.dtype)
-    # Beyond the last block: rows of no other unknown.
+    # An identity block after the last block, which is decoupled from it.
     beyond = jnp.concatenate([none, jnp.eye(width, dtype=matrix.dtype), none], axis=1)
     following = jnp.concatenate([matrix[1:], beyond[None]])
 
@@ -177,15 +183,15 @@ def _eliminated(
         whole = jnp.concatenate(
             [jnp.concatenate([left, none], axis=1), rows]
         )  # two_widths, three_widths
-        turn, order = pivot_rows_first(whole[:, :width])
-        upper, left = reduced(turn, order, whole[:, width:])
-        return left, (turn, order, upper)
+        reduction, order = eliminate_columns(whole[:, :width])
+        upper, left = apply_reduction(reduction, order, whole[:, width:])
+        return left, (reduction, order, upper)
 
     return jax.lax.scan(eliminate, matrix[0, :, width:], following)[1]
 
 
 def _substituted(
-    turns: Float[Array, "blocks two_widths width"],
+    reductions: Float[Array, "blocks two_widths width"],
     orders: Int[Array, "blocks two_widths"],
     upper: Float[Array, "blocks width two_widths"],
     right: Float[Array, "blocks width"],
@@ -194,13 +200,13 @@ def _substituted(
     width = none.size
 
     def forward(left, item):
-        turn, order, rows = item
+        reduction, order, rows = item
         rows = jnp.concatenate([left, rows])[order]
-        turned = _times(turn, rows[:width])
-        return rows[width:] + turned[width:], turned[:width]
+        products = _times(reduction, rows[:width])
+        return rows[width:] + products[width:], products[:width]
 
     following = jnp.concatenate([right[1:], none[None]])
-    _, solved = jax.lax.scan(forward, right[0], (turns, orders, following))
+    _, solved = jax.lax.scan(forward, right[0], (reductions, orders, following))
 
     def backward(after, item):
         rows, value = item
@@ -212,7 +218,7 @@ def _substituted(
 
 
 def _times(matrix: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"]:
-    if matrix.shape[1] >= 2 * LIBRARY:
+    if matrix.shape[1] >= 2 * LAPACK_FROM:
         return matrix @ x
-    # Rows side by side, by vector instructions.
+    # XLA vectorises this sum over the rows.
     return jnp.sum(matrix * x[None], axis=1)

@@ -1,4 +1,4 @@
-"""Symmetric matrices of small blocks along the diagonal: the inertia of many bodies."""
+"""Symmetric block-diagonal matrices, such as the inertia of many bodies."""
 
 from collections.abc import Callable
 from typing import Any, TypeAlias
@@ -14,15 +14,19 @@ from scipy.sparse.csgraph import connected_components
 from ..._programs import Indices, is_known, jacobian_pattern, summed
 
 
-# Rows of the largest block that counts as small, and of a matrix that is not worth it.
-_BLOCK = 16
+# The largest block size for which a matrix is stored in blocks, and the size up to which a
+# matrix is always stored as an array.
+_LARGEST_BLOCK = 16
 _FEW = 8
 
 
 class Places(Indices):
-    """Which rows belong together; the same for a matrix and its inverse.
+    """The rows of each block; the same for a matrix and its inverse.
 
-    `filling` are the ones on the diagonal where a block is smaller than the largest.
+    - `rows`: the rows of each block, shape `(blocks, size)`; the number of rows at padded
+      positions, where a block is smaller than the largest one.
+    - `padding`: ones on the diagonal at padded positions.
+    - `back`: the position of each row in the blocks, and `within`: in its own block.
     """
 
     def __init__(self, labels: np.ndarray):
@@ -33,7 +37,7 @@ class Places(Indices):
         within = np.arange(size) - starts[labels[order]]
         self.rows = np.full((sizes.size, sizes.max()), size)
         self.rows[labels[order], within] = order
-        self.filling = (self.rows == size)[:, :, None] * np.eye(sizes.max())
+        self.padding = (self.rows == size)[:, :, None] * np.eye(sizes.max())
         self.back = np.zeros(size, int)
         self.back[order] = labels[order] * sizes.max() + within
         self.within = np.zeros(size, int)
@@ -41,9 +45,9 @@ class Places(Indices):
 
 
 class BlockDiagonal(eqx.Module):
-    """A matrix of blocks; where a block is smaller than the largest, ones fill it up.
+    """A symmetric block-diagonal matrix, which can be multiplied like an array.
 
-    Takes the place of an array in products with vectors.
+    All blocks have the size of the largest one. Smaller blocks are padded with an identity.
     """
 
     places: Places = eqx.field(static=True)
@@ -59,8 +63,8 @@ class BlockDiagonal(eqx.Module):
         return self.blocks.dtype
 
     def __matmul__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        parts = jnp.append(x, 0)[self.places.rows]
-        return summed(self.blocks * parts[:, None, :]).ravel()[self.places.back]
+        by_block = jnp.append(x, 0)[self.places.rows]
+        return summed(self.blocks * by_block[:, None, :]).ravel()[self.places.back]
 
     def __rmatmul__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         return self @ x  # symmetric
@@ -74,34 +78,34 @@ Symmetric: TypeAlias = Float[Array, "n n"] | BlockDiagonal
 
 
 def inverse_of(matrix: Symmetric) -> Symmetric:
-    """Of a positive definite matrix."""
+    """The inverse of a positive definite matrix."""
     if isinstance(matrix, BlockDiagonal):
         return BlockDiagonal(matrix.places, jax.vmap(_inverse)(matrix.blocks))
     return _inverse(matrix)
 
 
 def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    # Scaled to a unit diagonal first: a diagonal one is then inverted to the last digit,
-    # whatever the ratios are.
+    # Scaled to a unit diagonal first, so that diagonal matrices are inverted without
+    # rounding errors, whatever the ratios of their entries are.
     root = jnp.sqrt(jnp.diagonal(matrix))
     scale = jnp.outer(root, root)
     return jnp.linalg.inv(matrix / scale) / scale
 
 
 def as_dense(matrix: Symmetric) -> Float[Array, "n n"]:
-    """As a plain array."""
+    """The matrix as a plain array."""
     if not isinstance(matrix, BlockDiagonal):
         return matrix
     return jax.vmap(matrix.__matmul__)(jnp.eye(matrix.shape[0], dtype=matrix.dtype))
 
 
 def blocks_of(matrix: Symmetric) -> Float[Array, "blocks size size"]:
-    """What stands along the diagonal; a plain array is one block."""
+    """The blocks along the diagonal; a plain array is one block."""
     return matrix.blocks if isinstance(matrix, BlockDiagonal) else matrix[None]
 
 
 def hessian(fn: Callable[[Array], Array], at: Float[Array, " n"]) -> Symmetric:
-    """The Hessian of a scalar function; of blocks where it is large and falls apart."""
+    """The Hessian of a scalar function; block-diagonal if it is large and has that form."""
     gradient = jax.grad(fn)
     pattern = jacobian_pattern(gradient, at) if at.size > _FEW else None
     places = None if pattern is None else _places(pattern)
@@ -112,12 +116,12 @@ def hessian(fn: Callable[[Array], Array], at: Float[Array, " n"]) -> Symmetric:
     seeds = jnp.asarray(np.arange(size)[:, None] == places.within, at.dtype)
     push = lambda seed: jax.jvp(gradient, (at,), (seed,))[1]
     columns = jnp.pad(jax.vmap(push)(seeds), ((0, 0), (0, 1)))[:, places.rows]
-    filling = jnp.asarray(places.filling, at.dtype)
-    return BlockDiagonal(places, jnp.transpose(columns, (1, 2, 0)) + filling)
+    padding = jnp.asarray(places.padding, at.dtype)
+    return BlockDiagonal(places, jnp.transpose(columns, (1, 2, 0)) + padding)
 
 
 def in_blocks(matrix: Float[Array, "n n"]) -> Symmetric:
-    """A given matrix; of blocks where it is large, known and falls apart."""
+    """The matrix in block-diagonal form, if it is large, known and has that form."""
     if matrix.shape[0] <= _FEW or not is_known(matrix):
         return matrix
     places = _places(csr_array(np.asarray(matrix) != 0))
@@ -125,9 +129,9 @@ def in_blocks(matrix: Float[Array, "n n"]) -> Symmetric:
         return matrix
     padded = jnp.pad(matrix, ((0, 1), (0, 1))).at[-1, -1].set(0)
     blocks = padded[places.rows[:, :, None], places.rows[:, None, :]]
-    return BlockDiagonal(places, blocks + jnp.asarray(places.filling, matrix.dtype))
+    return BlockDiagonal(places, blocks + jnp.asarray(places.padding, matrix.dtype))
 
 
 def _places(pattern: csr_array) -> Places | None:
     _, labels = connected_components(pattern, directed=False)
-    return Places(labels) if np.bincount(labels).max() <= _BLOCK else None
+    return Places(labels) if np.bincount(labels).max() <= _LARGEST_BLOCK else None

@@ -20,7 +20,7 @@ from .norms import largest
 
 # Rows up to which plain operations beat LAPACK.
 SMALL = 32
-# Rows up to which the elimination is written out: it compiles slowly.
+# Rows up to which the loop over columns is unrolled. Longer unrolled loops compile slowly.
 _UNROLLED = 3
 
 
@@ -31,13 +31,13 @@ def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 @jax.jit
 def enerjax_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The discrete derivative and the patterns know it by its name, also under `vmap`."""
+    """The rules of discrete derivatives and sparsity patterns find it by this name."""
     return _inverse(matrix)
 
 
 @jax.custom_jvp
 def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """By Gauss-Jordan elimination in place with row pivoting; rows are not exchanged."""
+    """In-place Gauss-Jordan elimination with row pivoting, without exchanging rows."""
     size = matrix.shape[0]
     if size == 1:
         return 1 / matrix
@@ -49,15 +49,15 @@ def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
         table, free, rows, columns = carry
         entries = jax.lax.dynamic_slice(table, (0, k), (size, 1))[:, 0]
         sizes = jnp.where(free, jnp.abs(entries), -1)
-        # The first of the largest: cheaper as two plain reductions than `argmax`. (Where
-        # an entry is not a number there is none.)
+        # The first of the largest entries. Two reductions cost less than `argmax`. (If an
+        # entry is NaN there is none, and the pivot is `size`.)
         pivot = jnp.min(jnp.where(sizes == jnp.max(sizes), order, size))
         chosen = order == pivot
         row = jax.lax.dynamic_slice(table, (pivot, 0), (1, size))[0]
         entry = jax.lax.dynamic_slice(entries, (pivot,), (1,))[0]
-        # All becomes so then.
+        # The whole inverse is NaN then.
         entry = jnp.where(pivot < size, entry, jnp.nan)
-        # The unknown of the column and the right-hand side of the row change places.
+        # Exchanges the unknown of the column with the right-hand side of the row.
         row = jnp.where(order == k, 1, row) / entry
         factors = jnp.where(chosen, 0, entries)
         kept = jnp.where((order == k)[None], 0, table) - factors[:, None] * row[None]
@@ -77,57 +77,58 @@ def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 @_inverse.defjvp
 def _inverse_jvp(primals, tangents):
-    # Matrix products alone, however often it is differentiated.
+    # Derivatives of any order consist of matrix products alone.
     (x,), (dx,) = primals, tangents
     y = inverse(x)
     return y, -_sums(_sums(y, dx), y)
 
 
 def _sums(a: Float[Array, "n n"], b: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """`a @ b`; many tangents of it at once are faster so."""
+    """`a @ b`, as a sum that is faster for batches of tangents."""
     if a.shape[0] ** 3 > LARGEST_SUM:
         return product(a, b)
     return jnp.sum(a[:, :, None] * b[None], axis=1)
 
 
 class AbstractFactors(eqx.Module):
-    """What is kept of a matrix to solve with it, and to begin the next one with."""
+    """The factors of a matrix, which may also speed up the next factorisation."""
 
     @abc.abstractmethod
     def renewed(self, matrix: Float[Array, "n n"]) -> "AbstractFactors":
-        """Of another matrix; one that differs little can cost less."""
+        """The factors of another matrix; they may cost less if it differs little."""
 
     @abc.abstractmethod
     def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Nearly `matrix^-1 right`; not finite where the matrix is singular."""
+        """Approximately `matrix^-1 right`; not finite where the matrix is singular."""
 
 
 class Inverse(AbstractFactors):
-    """An approximate inverse, which a chord iteration makes good.
+    """An approximate inverse. Its small error is corrected by the iterations that use it.
 
-    Renewed by the iteration of G. Schulz (1933), `X (1 + E)` with `E = 1 - A X`, which
-    leaves `E^2`; computed afresh where the old one is too far off. Of the matrix with rows
-    of size one: others would make `E` look larger than it is.
+    The inverse `X` of a new matrix `A` is found by the iteration of G. Schulz (1933), which
+    replaces `X` by `X (1 + E)` with `E = 1 - A X`; the new error is `E^2`. Where `E` is too
+    large, the inverse is computed by elimination. The rows of `A` are scaled to a largest
+    entry of one first, because rows of unequal size would enlarge `E`.
     """
 
     inverse: Float[Array, "n n"]
 
     @classmethod
     def empty(cls, size: int, dtype: Any) -> "Inverse":
-        """Of no matrix yet: corrects nothing, and is renewed."""
+        """A placeholder of NaNs, which `renewed` replaces by an elimination."""
         return cls(jnp.full((size, size), jnp.nan, dtype))
 
     def renewed(self, matrix: Float[Array, "n n"]) -> "Inverse":
         sizes = jnp.max(jnp.abs(matrix), axis=1)
         matrix = matrix / sizes[:, None]
 
-        # Of carries: an inverse, the error that it had before it was improved, as a matrix,
-        # and a bound on the size of what that has left.
+        # A carry contains the inverse, its error `E` before the last iteration, and a bound
+        # on the norm of its error now.
         def is_rough(carry) -> Flag:
             _, _, left = carry
             return (left > _ENOUGH) & (left < _FAR)
 
-        def turn(carry):
+        def improve(carry):
             x, error, _ = carry
             error, size = unmerged(_square)(error)
             return x + product(x, error), error, size * size
@@ -138,15 +139,16 @@ class Inverse(AbstractFactors):
 
         def start_again(carry):
             _, error, left = carry
-            # By a one that XLA cannot see: it would move what does not change in a loop out
-            # of it, and eliminate in every step.
+            # XLA would move this elimination out of the loop, because it does not depend on
+            # the carry, and compute it in every step. The factor of one, which depends on
+            # the carry, prevents that.
             one = jnp.where(left < _FAR, 0, jnp.ones_like(left))
             return inverse(one * matrix), error, jnp.zeros_like(left)
 
         x = self.inverse * sizes[None]
         error, size = unmerged(_defect)(matrix, x)
         carry = x + product(x, error), error, jnp.where(size < _FAR, size * size, size)
-        carry = jax.lax.while_loop(is_rough, turn, carry)
+        carry = jax.lax.while_loop(is_rough, improve, carry)
         x, _, _ = jax.lax.while_loop(is_lost, start_again, carry)
         return Inverse(x / sizes[None])
 
@@ -155,7 +157,7 @@ class Inverse(AbstractFactors):
 
 
 class LU(AbstractFactors):
-    """The factors of LAPACK."""
+    """The triangular factors `P A = L U`, by LAPACK."""
 
     factors: Float[Array, "n n"]
     permutation: Int[Array, " n"]
@@ -177,14 +179,14 @@ class LU(AbstractFactors):
 
 
 def solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Differentiable, and transposable in `right`."""
+    """`matrix^-1 right`, differentiable and transposable in `right`."""
     if matrix.shape[0] > SMALL:
         return jnp.linalg.solve(matrix, right)
     return inverse(matrix) @ right
 
 
-# Errors of an inverse beyond which it is computed afresh, and which are small enough for a
-# chord iteration to gain as many digits at a time.
+# The error of an inverse above which it is computed by elimination, and the error that is
+# small enough: each correction with the inverse then gains seven digits.
 _FAR = 0.3
 _ENOUGH = 1e-7
 
@@ -193,20 +195,20 @@ def product(a: Float[Array, "n k"], b: Any) -> Float[Array, "n m"]:
     """`a @ b`, which XLA fuses with its surroundings where both are small arrays."""
     if a.shape[1] > SMALL or not isinstance(b, jax.Array):
         return a @ b
-    # Row by row of `b`: the inner loop is over neighbours, and is vectorised.
+    # A sum over the rows of `b`: the inner loop runs over contiguous entries.
     terms = [a[:, k, None] * b[None, k] for k in range(a.shape[1])]
     return functools.reduce(jnp.add, terms) if terms else a @ b
 
 
 def _defect(matrix: Array, inverse: Array) -> tuple[Array, Scalar]:
-    """What an inverse leaves of the identity, and the size of that."""
+    """The error `1 - A X` of an inverse, and its norm."""
     identity = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
     defect = identity - product(matrix, inverse)
     return defect, _row_sum(defect)
 
 
 def _square(e: Float[Array, "n n"]) -> tuple[Array, Scalar]:
-    """`e^2` and its size."""
+    """`e^2` and its norm."""
     square = product(e, e)
     return square, _row_sum(square)
 

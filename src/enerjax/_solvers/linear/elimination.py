@@ -1,4 +1,4 @@
-"""One step of a block elimination: some columns of a few rows."""
+"""One step of a block elimination: a few columns are eliminated from some rows."""
 
 import functools
 
@@ -10,62 +10,65 @@ from .dense import product
 
 
 # Columns from which LAPACK is faster than plain operations.
-LIBRARY = 16
-# Columns up to which the elimination is written out: it compiles slowly.
+LAPACK_FROM = 16
+# Columns up to which the loop over columns is unrolled. Longer unrolled loops compile
+# slowly.
 _UNROLLED = 8
 
 
-def pivot_rows_first(
+def eliminate_columns(
     panel: Float[Array, "m w"],
 ) -> tuple[Float[Array, "m w"], Int[Array, " m"]]:
-    """What reduces the first columns of some rows to those of the identity.
+    """The elimination, with row pivoting, of the first `w` unknowns from `m` rows.
 
-    With row pivoting: the order of the rows, those that were pivots first, and the matrix
-    by which these, in that order, are solved for the `w` unknowns and taken off the rest;
-    see `reduced`.
+    `panel` contains the first `w` columns of these rows. Returns the reduction and the
+    order of the rows, the `w` pivot rows first. The first `w` rows of the reduction are the
+    inverse of the pivot rows. The others multiply the pivot rows, and give what is added to
+    the remaining rows to eliminate the unknowns; see `apply_reduction`.
     """
-    return _by_library(panel) if panel.shape[1] >= LIBRARY else _by_hand(panel)
+    return _by_lapack(panel) if panel.shape[1] >= LAPACK_FROM else _by_gauss_jordan(panel)
 
 
-def reduced(
-    turn: Float[Array, "m w"], order: Int[Array, " m"], rows: Float[Array, "m k"]
+def apply_reduction(
+    reduction: Float[Array, "m w"], order: Int[Array, " m"], rows: Float[Array, "m k"]
 ) -> tuple[Float[Array, "w k"], Float[Array, "rest k"]]:
-    """The other columns of the rows: of the pivots, and of what is left."""
-    count = turn.shape[1]
+    """The elimination applied to further columns: the pivot rows, and the other rows."""
+    count = reduction.shape[1]
     rows = rows[order]
     pivots = rows[:count]
-    turned = turn @ pivots if count >= LIBRARY else product(turn, pivots)
-    return turned[:count], rows[count:] + turned[count:]
+    products = reduction @ pivots if count >= LAPACK_FROM else product(reduction, pivots)
+    return products[:count], rows[count:] + products[count:]
 
 
-def _by_library(panel: Float[Array, "m w"]) -> tuple[Array, Array]:
-    """`P rows = [L1; L2] U`: `(L1 U)^-1`, and less `L2 L1^-1`."""
+def _by_lapack(panel: Float[Array, "m w"]) -> tuple[Array, Array]:
+    """From `P rows = [L1; L2] U`: the reduction is `[(L1 U)^-1; -L2 L1^-1]`."""
     count = panel.shape[1]
     panel, _, order = jax.lax.linalg.lu(panel)
     own, below = panel[:count], panel[count:]
     solve = jax.lax.linalg.triangular_solve
     eye = jnp.eye(count, dtype=panel.dtype)
     inverse = solve(own, eye, left_side=True, lower=True, unit_diagonal=True)
-    turn = jnp.concatenate([solve(own, inverse, left_side=True), -below @ inverse])
-    return turn, order.astype(jnp.arange(1).dtype)
+    reduction = jnp.concatenate([solve(own, inverse, left_side=True), -below @ inverse])
+    return reduction, order.astype(jnp.arange(1).dtype)
 
 
-def _by_hand(panel: Float[Array, "m w"]) -> tuple[Array, Array]:
-    """By Gauss and Jordan in place, without a call that would break up the loop around."""
+def _by_gauss_jordan(panel: Float[Array, "m w"]) -> tuple[Array, Array]:
+    """In-place Gauss-Jordan elimination, without calls that XLA cannot fuse."""
     num_rows, count = panel.shape
     numbers = jnp.arange(num_rows)
 
     def column(k, carry):
         panel, order = carry
         sizes = jnp.where(numbers >= k, jnp.abs(panel[:, 0]), -1)
-        # The first of the largest: cheaper as two plain reductions than `argmax`. (Where
-        # an entry is not a number there is none, and all becomes so.)
+        # The first of the largest entries. Two reductions cost less than `argmax`. (If an
+        # entry is NaN, all entries become NaN.)
         pivot = jnp.min(jnp.where(sizes == jnp.max(sizes), numbers, num_rows - 1))
         exchanged = jnp.where(numbers == pivot, k, numbers)
         exchanged = jnp.where(numbers == k, pivot, exchanged)
         panel, order = panel[exchanged], order[exchanged]
         is_pivot = numbers == k
-        # The column is done; that of the right-hand side takes its place, as the last.
+        # The eliminated column is dropped, and the column of the right-hand side of row `k`
+        # is appended.
         row = jnp.append(panel[k, 1:], 1) / panel[k, 0]
         factors = jnp.where(is_pivot, -1, panel[:, 0])
         rest = jnp.where(is_pivot[:, None], 0, panel[:, 1:])

@@ -1,6 +1,7 @@
-"""Regular matrices that fall apart into independent square blocks, wherever these stand.
+"""Regular matrices that become block-diagonal by permutations of their rows and columns.
 
-The map from rates of coordinates to velocities is one: each body has its own.
+The map from the rates of the coordinates to the velocities is such a matrix, with one block
+for each body.
 """
 
 from collections.abc import Callable
@@ -19,16 +20,18 @@ from ..._programs import Indices, is_known, jacobian_pattern
 from .dense import inverse
 
 
-class Parts(Indices):
-    """Which rows and columns of a matrix belong together.
+class IndependentBlocks(Indices):
+    """The rows and the columns of each block of a matrix.
 
-    - `groups`: for each size of blocks the rows and the columns of all of that size, two
-      arrays of shape `(blocks, size)`; first, of size zero, those that are just a one.
-    - `of_rows`, `of_columns`: where each is found in the groups, one behind the other.
+    - `groups`: for each block size, that size and the rows and columns of all blocks of
+      this size, two arrays of shape `(blocks, size)`. Blocks that contain the single entry
+      one are a group of their own, whose size is recorded as zero.
+    - `of_rows`, `of_columns`: the position of each row and column in the concatenated
+      groups.
     """
 
     def __init__(self, labels: np.ndarray, is_one: np.ndarray):
-        """Labels of rows and of columns, and whether the blocks so labelled are a one."""
+        """From the block number of each row and column, and which blocks are just a one."""
         super().__init__(np.concatenate([*labels, is_one]))
         sizes = np.bincount(labels[0])
         places = np.argsort(labels, axis=1, kind="stable")
@@ -41,10 +44,10 @@ class Parts(Indices):
         self.of_rows, self.of_columns = (np.argsort(np.concatenate(x)) for x in sides)
 
 
-def parts_of(constants: Float[np.ndarray, "n n"]) -> Parts | None:
-    """The blocks of a regular matrix, of which some entries are known and others NaN.
+def independent_blocks(constants: Float[np.ndarray, "n n"]) -> IndependentBlocks | None:
+    """The blocks of a regular matrix, from its constant entries; NaN for all others.
 
-    `None` where it is a single one.
+    `None` where the matrix has only one block.
     """
     size = len(constants)
     rows, columns = np.nonzero(constants)
@@ -53,20 +56,21 @@ def parts_of(constants: Float[np.ndarray, "n n"]) -> Parts | None:
     count, labels = connected_components(graph, directed=False)
     labels = labels.reshape(2, size)
     sizes, widths = (np.bincount(x, minlength=count) for x in labels)
-    # A matrix with blocks that are not square is singular: that is for others to find.
+    # A matrix with a block that is not square is singular. The solve will report that.
     if count == 1 or np.any(sizes != widths):
         return None
     ones = np.zeros(count, bool)
     ones[labels[0][rows[constants[rows, columns] == 1]]] = True
-    return Parts(labels, ones & (sizes == 1))
+    return IndependentBlocks(labels, ones & (sizes == 1))
 
 
 def constant_entries(
     fn: Callable[[PyTree[Array]], Array], inputs: PyTree
 ) -> Float[np.ndarray, "..."] | None:
-    """The entries of a function that are the same for all `inputs`; NaN for the others.
+    """The entries of the value of `fn` that do not depend on `inputs`; NaN for all others.
 
-    `None` where that cannot be told. Of the traced program: the numbers are not looked at.
+    They are found from the traced program, whatever the numbers in `inputs` are. `None`
+    where the program does not show which entries are constant.
     """
     numbers, rest = eqx.partition(inputs, eqx.is_inexact_array)
     if not is_known(rest):
@@ -80,37 +84,37 @@ def constant_entries(
     if pattern is None:
         return None
     with jax.ensure_compile_time_eval():
-        # What depends on nothing has its value at any point.
+        # A constant entry has its value at any point.
         somewhere = np.asarray(jax.jit(values)(np.ones(flat.shape, flat.dtype)))
     depends = (np.diff(pattern.indptr) > 0).reshape(somewhere.shape)
     return np.where(depends, np.nan, somewhere)
 
 
-def solve_parts(
-    parts: Parts | None, matrix: Float[Array, "n n"], right: Float[Array, " n"]
+def solve_by_blocks(
+    blocks: IndependentBlocks | None, matrix: Float[Array, "n n"], right: Float[Array, " n"]
 ) -> Float[Array, " n"]:
     """`matrix^-1 right`, differentiable; not finite where the matrix is singular."""
-    if parts is None:
+    if blocks is None:
         return inverse(matrix) @ right
     pieces = []
-    for size, rows, columns in parts.groups:
+    for size, rows, columns in blocks.groups:
         part = _take(right, rows)
         pieces.append(_solve(_blocks(matrix, rows, columns), part) if size else part)
-    return _joined(pieces, parts.of_columns)
+    return _joined(pieces, blocks.of_columns)
 
 
-def multiply_parts(
-    parts: Parts, matrix: Float[Array, "n n"], x: Float[Array, " n"]
+def multiply_by_blocks(
+    blocks: IndependentBlocks, matrix: Float[Array, "n n"], x: Float[Array, " n"]
 ) -> Float[Array, " n"]:
-    """`matrix @ x`: each row of what its block depends on, and on nothing else."""
+    """`matrix @ x`, where each row depends on the columns of its own block only."""
     pieces = []
-    for size, rows, columns in parts.groups:
+    for size, rows, columns in blocks.groups:
         part = _take(x, columns)
         pieces.append(_times(_blocks(matrix, rows, columns), part) if size else part)
-    return _joined(pieces, parts.of_rows)
+    return _joined(pieces, blocks.of_rows)
 
 
-# Blocks that are cut out one by one.
+# The number of blocks up to which they are extracted one by one.
 _FEW = 8
 
 
@@ -122,7 +126,7 @@ def _blocks(matrix: Array, rows: np.ndarray, columns: np.ndarray) -> Array:
 
 
 def _take(x: Array, indices: np.ndarray) -> Array:
-    """`x[indices]`, as a slice where it is one: XLA keeps that inside a loop."""
+    """`x[indices]`, as a slice if the indices are contiguous: XLA can fuse slices."""
     first, last = indices.flat[0], indices.flat[-1] + 1
     if np.array_equal(indices.ravel(), np.arange(first, last)):
         return x[first:last].reshape(*indices.shape, *x.shape[1:])

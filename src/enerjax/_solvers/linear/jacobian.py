@@ -1,4 +1,4 @@
-"""A function with its Jacobian, in the form that suits its size and structure."""
+"""Functions with their Jacobians, which are stored as their size and sparsity suggest."""
 
 from collections.abc import Callable
 from typing import Any
@@ -21,13 +21,13 @@ from ..._programs import (
 )
 from .banded import Band, coloured_products, column_colours
 from .dense import AbstractFactors, Inverse, inverse, LU, SMALL, solve
-from .user_solver import AbstractSparseSolver, LineaxFactors, Scattered
+from .user_solver import AbstractSparseSolver, LineaxFactors, Sparse
 
 
-class Full:
-    """A matrix that is stored as one array.
+class Dense:
+    """A Jacobian that is stored as a dense array.
 
-    Where its pattern is known, columns that share no row are found together.
+    If its sparsity pattern is known, columns that share no row are evaluated together.
     """
 
     def __init__(
@@ -38,13 +38,13 @@ class Full:
         if pattern is None:
             return
         self._colours = column_colours(pattern, np.arange(shape_of(pattern)[1]))
-        self._filled = pattern.toarray()
+        self._nonzero = pattern.toarray()
 
     def evaluate(self, fn: Callable[[Array], Array], x: Float[Array, " n"]) -> Array:
         if self._colours is None:
             return jacobian_columns(fn, x)
         columns = coloured_products(fn, x, self._colours)[:, self._colours]
-        return jnp.where(self._filled, columns, 0)
+        return jnp.where(self._nonzero, columns, 0)
 
     def empty(self, size: int, dtype: Any) -> AbstractFactors:
         if self.solver is None:
@@ -55,27 +55,31 @@ class Full:
 class Linearisable(eqx.Module):
     """A function from vectors to vectors, and linear algebra with its Jacobian.
 
-    Made while a program is traced, by `linearisable`. Small and full Jacobians are dense
-    arrays; those that can be ordered into a narrow band are bands.
+    It is constructed by `linearisable` at trace time.
+
+    - `value`: the function.
+    - `form`: how the Jacobian is stored and solved with: as a dense array, as a narrow
+      band, or as the list of entries that a user's sparse solver receives.
+    - `regularisation`: numbers that are added to the diagonal of a Jacobian that may be
+      singular; else `None`.
     """
 
     value: Callable[[Float[Array, " n"]], Float[Array, " n"]]
-    form: Full | Band | Scattered
-    # Added to the diagonal of a Jacobian that may be singular.
+    form: Dense | Band | Sparse
     regularisation: Float[Array, " n"] | None
 
     @property
     def is_dense(self) -> bool:
-        """Whether its Jacobian is dense, and solved with as this package sees fit."""
-        return isinstance(self.form, Full) and self.form.solver is None
+        """Whether the Jacobian is dense, and the user has chosen no solver."""
+        return isinstance(self.form, Dense) and self.form.solver is None
 
     @property
     def keeps_factors(self) -> bool:
-        """Whether the next iteration can begin with the factors of this one."""
+        """Whether the next search can begin with the factors of this one."""
         return self.is_dense
 
     def jacobian(self, x: Float[Array, " n"]) -> Array:
-        """The Jacobian, in the form that `first_factors` are renewed with."""
+        """The Jacobian, with the regularisation, as `AbstractFactors.renewed` takes it."""
         regularisation = self.regularisation
         value = self.value
         if regularisation is None:
@@ -85,34 +89,34 @@ class Linearisable(eqx.Module):
     def first_factors(
         self, kept: AbstractFactors | None, x: Float[Array, " n"]
     ) -> AbstractFactors:
-        """What the first Jacobian of an iteration renews."""
+        """The factors that the first Jacobian of a search renews."""
         if kept is not None and self.keeps_factors:
             return kept
         return self.form.empty(x.size, x.dtype)
 
     def solve(self, x: Float[Array, " n"], right: Float[Array, " n"]) -> Array:
-        """`J(x)^-1 right`, differentiable in all there is, and transposable in `right`.
+        """`J(x)^-1 right`, differentiable in all arguments and transposable in `right`.
 
-        For a singular Jacobian with a `regularisation` this is the solution that has no
-        part in its null space.
+        Where the Jacobian is singular and there is a `regularisation`, this is the solution
+        that is orthogonal to the null space.
         """
         solve = self.regularised_solver(x)
         first = solve(right)
-        # What a regularisation has changed is taken back, but for its square.
+        # Removes the error of first order in the regularisation.
         return (
             first
             if self.regularisation is None
             else first + solve(self.regularisation * first)
         )
 
-    def open_part(
+    def null_space_part(
         self, solve: Callable[[Array], Array], x: Float[Array, " n"]
     ) -> Float[Array, " n"]:
         """The part of `x` in the null space of the Jacobian.
 
-        `solve` solves with the regularised Jacobian.
-        The error is of second order in the regularisation. Unknowns without a
-        regularisation are determined by the equations and have no such part.
+        `solve` must solve with the regularised Jacobian. The error is of second order in
+        the regularisation. Unknowns without a regularisation are determined by the
+        equations, and their part is zero.
         """
         assert self.regularisation is not None
         return jnp.where(
@@ -128,7 +132,7 @@ class Linearisable(eqx.Module):
             return lambda right: found @ right
         matrix = self.jacobian(x)
         if self.is_dense:
-            # An explicit inverse loses too many digits of what is nearly singular.
+            # An explicit inverse of a nearly singular matrix is too inaccurate.
             by = solve if self.regularisation is None else jnp.linalg.solve
             return lambda right: by(matrix, right)
         matrix = jax.lax.stop_gradient(matrix)
@@ -139,9 +143,9 @@ class Linearisable(eqx.Module):
             return image if self.regularisation is None else image + self.regularisation * t
 
         def solve_transposed(_: Callable, right: Array) -> Array:
-            if isinstance(self.form, Scattered):
+            if isinstance(self.form, Sparse):
                 return self.form.solve_transposed(matrix, right)
-            # (`linear_transpose` has no rule for what is one function.)
+            # `linear_transpose` has no rule for programs compiled into one function.
             return jax.vjp(factors.solve, right)[1](right)[0]
 
         return lambda right: jax.lax.custom_linear_solve(
@@ -156,26 +160,26 @@ def linearisable(
     linear_solver: lx.AbstractLinearSolver | AbstractSparseSolver | None = None,
     regularisation: Float[Array, " n"] | None = None,
 ) -> Linearisable:
-    """`fn(x, args)` as a function of `x`; what it depends on must be in `args`.
+    """`fn(x, args)` as a function of `x`. All traced values must be passed in `args`.
 
-    Without a `linear_solver` the size and the structure of the Jacobian decide. The
-    `regularisation` is added to its diagonal where it may be singular.
+    By default the size and the sparsity of the Jacobian determine the linear solver. The
+    `regularisation` is added to the diagonal of a Jacobian that may be singular.
     """
     value = plain_products(fn, like, args)
     if isinstance(linear_solver, lx.AbstractLinearSolver):
-        return Linearisable(value, Full(linear_solver), regularisation)
+        return Linearisable(value, Dense(linear_solver), regularisation)
     regularised = (
         value if regularisation is None else lambda x: value(x) + regularisation * x
     )
     if linear_solver is not None:
         pattern = jacobian_pattern(regularised, like)
-        form = Scattered(linear_solver, pattern, like.size)
+        form = Sparse(linear_solver, pattern, like.size)
         return Linearisable(value, form, regularisation)
     pattern = jacobian_pattern(regularised, like) if like.size > LARGE else None
     if pattern is None:
-        return Linearisable(value, Full(None), regularisation)
+        return Linearisable(value, Dense(None), regularisation)
     band = Band(pattern)
-    form = band if band.worth_it() else Full(None, pattern)
+    form = band if band.is_cheaper_than_dense() else Dense(None, pattern)
     return Linearisable(value, form, regularisation)
 
 
@@ -184,9 +188,10 @@ def affine_root(
     like: Float[Array, " n"],
     regularisation: Float[Array, " n"] | None = None,
 ) -> Float[Array, " n"]:
-    """Where an affine function vanishes; differentiable in what it closes over.
+    """The root of an affine function, differentiable in the values in its closure.
 
-    With a `regularisation`, which is added to the diagonal, it need not be regular.
+    The linear part may be singular if there is a `regularisation`, which is added to its
+    diagonal.
     """
     at = jnp.zeros_like(like)
     linear = linearisable(lambda x, _: fn(x), at, None, regularisation=regularisation)
@@ -196,9 +201,10 @@ def affine_root(
 
 
 class RowPattern:
-    """Which unknowns each row of a function depends on. Made while a program is traced.
+    """The unknowns that each entry of a function depends on, found at trace time.
 
-    `columns`: their numbers, shape `(m, width)`; zeros fill short rows.
+    `columns`: the numbers of these unknowns, shape `(m, width)`. Rows with fewer unknowns
+    are padded with zeros.
     """
 
     def __init__(self, fn: Callable[[Array], Array], like: Float[Array, " n"]):
@@ -208,7 +214,7 @@ class RowPattern:
         if pattern is None:
             self.columns = np.broadcast_to(np.arange(size), (num_rows, size))
             self._colours = np.arange(size)
-            self._filled = np.ones((num_rows, size))
+            self._nonzero = np.ones((num_rows, size))
             return
         self._colours = column_colours(pattern, np.arange(size))
         counts = np.diff(pattern.indptr)
@@ -216,26 +222,33 @@ class RowPattern:
         within = np.arange(rows.size) - np.repeat(pattern.indptr[:-1], counts)
         self.columns = np.zeros((num_rows, max(counts.max(initial=0), 1)), int)
         self.columns[rows, within] = pattern.indices
-        self._filled = np.zeros(self.columns.shape)
-        self._filled[rows, within] = 1
+        self._nonzero = np.zeros(self.columns.shape)
+        self._nonzero[rows, within] = 1
 
     def own(self, x: Float[Array, " n"]) -> Float[Array, "m width"]:
-        """The unknowns of each row; zeros fill short rows."""
-        return x[self.columns] * jnp.asarray(self._filled, x.dtype)
+        """The values of the unknowns of each row, padded with zeros."""
+        return x[self.columns] * jnp.asarray(self._nonzero, x.dtype)
 
     def derivative(
         self, fn: Callable[[Array], Array], x: Float[Array, " n"]
     ) -> Float[Array, "m ... width"]:
-        """Of a function with such rows, `(m, ...)`; zeros where the rows are short."""
+        """The derivatives of the rows of `fn` with respect to the unknowns of each row.
+
+        `fn` returns an array of shape `(m, ...)` with this pattern or a sparser one. Short
+        rows are padded with zeros.
+        """
         products = coloured_products(fn, x, self._colours)
         num_rows, width = self.columns.shape
         numbers = np.arange(num_rows)
         entries = products[numbers[:, None], ..., self._colours[self.columns]]
         entries = jnp.moveaxis(entries, 1, -1)
         shape = (num_rows, *[1] * (entries.ndim - 2), width)
-        return entries * jnp.asarray(self._filled, x.dtype).reshape(shape)
+        return entries * jnp.asarray(self._nonzero, x.dtype).reshape(shape)
 
 
 def kept_factors(size: int, dtype: Any) -> AbstractFactors | None:
-    """What a solve hands to the next at first: an inverse, where it is small."""
+    """The initial factors of a run whose solves pass their factors on, else `None`.
+
+    Only small systems, whose factors are an approximate inverse, pass them on.
+    """
     return Inverse.empty(size, dtype) if size <= SMALL else None

@@ -5,10 +5,10 @@ from ..._types import Scalar
 
 
 def largest(x: Array) -> Scalar:
-    """The largest entry in size, infinite if one is not a number.
+    """The largest absolute value; infinite if an entry is NaN.
 
-    A plain maximum would not do: reductions of large arrays on CPUs overlook what is not a
-    number (jaxlib 0.10), and a failure would pass for a success.
+    A plain maximum is not sufficient, because on CPUs reductions of large arrays ignore NaN
+    (jaxlib 0.10), and a failed solve would be reported as successful.
     """
     sizes = jnp.abs(x)
     return jnp.max(jnp.where(jnp.isnan(sizes), jnp.inf, sizes), initial=0.0)

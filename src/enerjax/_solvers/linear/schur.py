@@ -1,10 +1,11 @@
 """The Schur complement `G = B W B^T` of sparse rows `B` and a block-diagonal `W`.
 
-It is the matrix of the multipliers of constraints with the gradients `B`, where `W` is the
-inverse inertia. Rows meet where they touch the same body, so `G` is as sparse as the graph
-of the mechanism. Its rows are numbered by reverse Cuthill-McKee and cut into blocks that
-meet only their neighbours. The elimination goes from block to block. `G` is symmetric and
-positive definite, so the order of the blocks needs no pivoting.
+It is the matrix of the equations for the multipliers of constraints with gradients `B`,
+where `W` is the inverse inertia. Two constraints are coupled in `G` only if they act on a
+common body, so `G` is as sparse as the graph of the mechanism. Its rows are numbered by the
+reverse Cuthill-McKee algorithm and divided into blocks, so that `G` is block tridiagonal,
+and it is eliminated block by block. `G` is symmetric and positive definite, so the
+elimination needs no pivoting.
 """
 
 import functools
@@ -25,30 +26,30 @@ from .blocks import BlockDiagonal, Symmetric
 from .dense import inverse
 
 
-# Unknowns up to which each row is taken to depend on all of them.
+# The number of unknowns up to which `B` is treated as dense.
 _FEW = 8
-# Rows of the largest block. Beyond this the elimination is no longer small work.
+# The largest number of rows of a block. Larger blocks would be eliminated too slowly.
 _WIDEST = 32
-# Rows of blocks whose elimination is written out.
+# The number of rows up to which the loop that inverts a block is unrolled.
 _UNROLLED = 16
 
 
 class SchurTables(Indices):
-    """Where the entries of `B` and of `G` stand. Made while a program is traced.
+    """The index tables by which the entries of `B` and `G` are found.
 
-    A row of `B` is stored as its parts in the blocks of `W` that it touches.
+    They are constructed at trace time. A row of `B` is stored as segments, one for each
+    block of `W` in which it has entries. Indices of absent entries are one past the end.
 
-    - `colours`: of the columns of `B`; columns of a colour share no row.
-    - `touched`: the blocks that each row touches, `(rows, parts)`; the number of blocks
-      stands where there are fewer.
-    - `columns`: the unknowns of each part, `(rows, parts, size)`; the number of unknowns
-      stands where there is none.
-    - `entries`: where each entry stands in the coloured products, and `transposed`: where
-      the entries of each unknown stand among those of `B`; beyond the last for zeros.
-    - `diagonal`, `below`: for each block of `G`, on the diagonal and below, where its rows
-      and those of its columns stand among the entries of `B`; see `_shared`.
-    - `order`: the numbers of the rows along the blocks, `back`: where each row stands.
-    - `filling`: ones on the diagonal where a block is smaller than the largest.
+    - `colours`: the colours of the columns of `B`. Columns of equal colour share no row.
+    - `touched`: the block of `W` of each segment, shape `(rows, segments)`.
+    - `columns`: the unknowns of each segment, shape `(rows, segments, size)`.
+    - `entries`: the index of each entry of the segments in the coloured products.
+    - `transposed`: the indices of the entries of each column of `B` in the segments.
+    - `diagonal`, `below`: for each block of `G`, on and below the diagonal, the indices in
+      the segments of the entries that it is computed from; see `_shared`.
+    - `order`: the row of `G` at each position of its blocks.
+    - `back`: the position of each row of `G` in its blocks.
+    - `padding`: ones on the diagonal where a block is smaller than the largest one.
     """
 
     def __init__(self, pattern: csr_array, weight: Symmetric):
@@ -62,8 +63,8 @@ class SchurTables(Indices):
         label = np.zeros(size + 1, int)
         label[blocks.ravel()] = np.repeat(np.arange(len(blocks)), blocks.shape[1])
         incidence[rows, label[columns]] = True
-        parts = max(int(incidence.sum(axis=1).max(initial=0)), 1)
-        self.touched = np.full((self.num_rows, parts), len(blocks))
+        segments = max(int(incidence.sum(axis=1).max(initial=0)), 1)
+        self.touched = np.full((self.num_rows, segments), len(blocks))
         for row, touched in zip(self.touched, incidence, strict=True):
             row[: touched.sum()] = np.flatnonzero(touched)
         none = np.full((1, blocks.shape[1]), size)
@@ -73,10 +74,10 @@ class SchurTables(Indices):
 
     def _find_entries(self, pattern: csr_array, size: int) -> None:
         num_colours = int(self.colours.max(initial=0)) + 1
-        filled = np.zeros((self.num_rows, size + 1), bool)
-        filled[pattern.nonzero()] = True
+        nonzero = np.zeros((self.num_rows, size + 1), bool)
+        nonzero[pattern.nonzero()] = True
         row = np.arange(self.num_rows)[:, None, None]
-        known = filled[row, self.columns]
+        known = nonzero[row, self.columns]
         place = row * num_colours + np.append(self.colours, 0)[self.columns]
         self.entries = np.where(known, place, self.num_rows * num_colours)
         places, columns = np.flatnonzero(known), self.columns[known]
@@ -87,9 +88,9 @@ class SchurTables(Indices):
         self.transposed[columns[order], within] = places[order]
 
     def _cut(self, incidence: csr_array) -> None:
-        meeting = csr_array(incidence @ incidence.T)
-        order = reverse_cuthill_mckee(meeting, symmetric_mode=True)
-        sizes = block_sizes(csr_array(meeting[order][:, order]))
+        coupling = csr_array(incidence @ incidence.T)
+        order = reverse_cuthill_mckee(coupling, symmetric_mode=True)
+        sizes = block_sizes(csr_array(coupling[order][:, order]))
         self.width, self.num_blocks = int(sizes.max(initial=1)), sizes.size
         number = np.repeat(np.arange(sizes.size), sizes)
         within = np.arange(self.num_rows) - (np.cumsum(sizes) - sizes)[number]
@@ -98,15 +99,15 @@ class SchurTables(Indices):
         self.order = np.full(sizes.size * self.width, self.num_rows)
         self.order[self.back] = np.arange(self.num_rows)
         along = self.order.reshape(self.num_blocks, self.width)
-        self.filling = (along == self.num_rows)[:, :, None] * np.eye(self.width)
+        self.padding = (along == self.num_rows)[:, :, None] * np.eye(self.width)
         self.diagonal = self._shared([(rows, rows) for rows in along])
         self.below = self._shared([(after, rows) for rows, after in pairwise(along)])
 
     def _shared(self, pairs: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        """Where two blocks of rows stand in the unknowns that both touch.
+        """The entries of `B` in the columns that two blocks of rows have in common.
 
-        For each pair the entries of the rows of either block among those of `B`, of shape
-        `(2, pairs, width, unknowns)`; beyond the last for zeros.
+        Returns the indices of the entries of the rows of both blocks of each pair, shape
+        `(2, pairs, width, columns)`. Indices of absent entries are one past the end.
         """
         size, none = self.transposed.shape[0], self.columns.size
         places = np.full((self.num_rows + 1, size + 1), none)
@@ -119,8 +120,8 @@ class SchurTables(Indices):
             np.flatnonzero(touched[a].any(axis=0) & touched[b].any(axis=0))
             for a, b in pairs
         ]
-        most = max(map(len, shared), default=0)
-        table = np.full((2, len(pairs), self.width, most), none)
+        max_shared = max(map(len, shared), default=0)
+        table = np.full((2, len(pairs), self.width, max_shared), none)
         for k, (sides, columns) in enumerate(zip(pairs, shared, strict=True)):
             for side, rows in enumerate(sides):
                 table[side, k, :, : columns.size] = places[rows][:, columns]
@@ -128,10 +129,15 @@ class SchurTables(Indices):
 
 
 class Schur(eqx.Module):
-    """`B`, and `G = B W B^T` eliminated."""
+    """`B`, and the block factorisation of `G = B W B^T`.
+
+    - `rows`: the segments of the rows of `B`; see `SchurTables`.
+    - `factors`: the blocks below the diagonal of the unit lower triangular factor.
+    - `inverses`: the inverses of the diagonal blocks.
+    """
 
     tables: SchurTables = eqx.field(static=True)
-    rows: Float[Array, "rows parts size"]
+    rows: Float[Array, "rows segments size"]
     factors: Float[Array, "below width width"]
     inverses: Float[Array, "blocks width width"]
 
@@ -145,7 +151,7 @@ class Schur(eqx.Module):
         return summed(entries[self.tables.transposed])
 
     def solve(self, right: Float[Array, "k rows"]) -> Float[Array, "k rows"]:
-        """`G^-1` times some vectors."""
+        """`G^-1` times each of `k` vectors."""
         tables = self.tables
         count = right.shape[0]
         padded = jnp.concatenate([right, jnp.zeros((count, 1), right.dtype)], axis=1)
@@ -160,7 +166,7 @@ class Schur(eqx.Module):
     def _substituted(
         self, along: Float[Array, "blocks k width"]
     ) -> Float[Array, "blocks k width"]:
-        """Down along the blocks, and up."""
+        """The forward and the backward substitution along the blocks."""
 
         def forward(before, item):
             factor, value = item
@@ -190,7 +196,7 @@ def _products(
 def schur_tables(
     fn: Callable[[Array], Array], like: Float[Array, " n"], weight: Symmetric
 ) -> SchurTables | None:
-    """The tables for the Jacobian of `fn`; `None` where no narrow blocks are found."""
+    """The tables for the Jacobian of `fn`; `None` if it has no rows or too wide blocks."""
     num_rows = jax.eval_shape(fn, like).shape[0]
     pattern = jacobian_pattern(fn, like) if like.size > _FEW else None
     if num_rows == 0:
@@ -207,9 +213,10 @@ def schur(
     at: Float[Array, " n"],
     weight: Symmetric,
 ) -> Schur:
-    """`G` of the Jacobian of `fn` at a point."""
+    """The factorised `G`, where `B` is the Jacobian of `fn` at a point."""
     products = coloured_products(fn, at, tables.colours)
-    # The tables are read many times over: each of their entries is computed once.
+    # Compiled separately, because each entry is used many times, and XLA would otherwise
+    # compute it again for each use.
     rows, weighted = unmerged(functools.partial(_weighted, tables))(products, weight)
     diagonal, below = _blocks(tables, rows, weighted)
     if tables.num_blocks == 1:
@@ -230,7 +237,7 @@ def schur(
 def _weighted(
     tables: SchurTables, products: Float[Array, "rows colours"], weight: Symmetric
 ) -> tuple[Array, Array]:
-    """The parts of `B`, and of `B W`."""
+    """The segments of the rows of `B`, and of `B W`."""
     rows = jnp.append(products.ravel(), 0)[tables.entries]
     if isinstance(weight, BlockDiagonal):
         none = jnp.zeros((1, *weight.blocks.shape[1:]), rows.dtype)
@@ -241,7 +248,7 @@ def _weighted(
 
 
 def _blocks(tables: SchurTables, rows: Array, weighted: Array) -> tuple[Array, Array]:
-    """The blocks of `G` on its diagonal and below."""
+    """The blocks of `G` on and below its diagonal."""
     left, right = (jnp.append(x.ravel(), 0) for x in (weighted, rows))
 
     def blocks(table: np.ndarray) -> Array:
@@ -250,12 +257,12 @@ def _blocks(tables: SchurTables, rows: Array, weighted: Array) -> tuple[Array, A
         shape = (table.shape[1], tables.width, tables.width)
         return functools.reduce(jnp.add, terms, jnp.zeros(shape, rows.dtype))
 
-    filling = jnp.asarray(tables.filling, rows.dtype)
-    return blocks(tables.diagonal) + filling, blocks(tables.below)
+    padding = jnp.asarray(tables.padding, rows.dtype)
+    return blocks(tables.diagonal) + padding, blocks(tables.below)
 
 
 def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Of a positive definite matrix, by elimination in place. No row has to be found."""
+    """The inverse of a positive definite matrix, by in-place elimination; no pivoting."""
     size = matrix.shape[0]
     if size > _UNROLLED:
         return inverse(matrix)

@@ -1,4 +1,4 @@
-"""Roots and eigenvectors of small symmetric matrices, in plain array operations."""
+"""Cholesky factors and eigenvectors of small symmetric matrices, by plain operations."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from .dense import inverse, SMALL
 
 @jax.custom_jvp
 def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The lower triangular root; not finite where the matrix is not positive definite."""
+    """The lower Cholesky factor; not finite where the matrix is not positive definite."""
     size = matrix.shape[0]
     if size > SMALL:
         return jnp.linalg.cholesky(matrix)
@@ -30,7 +30,7 @@ def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 @cholesky.defjvp
 def _cholesky_jvp(primals, tangents):
-    # dL = L low(L^-1 dA L^-T), with half the diagonal.
+    # dL = L low(L^-1 dA L^-T), where `low` is the lower triangle with half the diagonal.
     (x,), (dx,) = primals, tangents
     root = cholesky(x)
     back = inverse(root)
@@ -40,10 +40,10 @@ def _cholesky_jvp(primals, tangents):
 
 
 def eigh(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """Eigenvalues, in no order, and eigenvectors of a symmetric matrix."""
+    """The eigenvalues, not sorted, and the eigenvectors of a symmetric matrix."""
     if matrix.shape[0] == 1:
-        # Its vector is the same in every lane of a batch, its tangent formally not: under
-        # `vmap` the two below must have the same lanes.
+        # Under `vmap` the rule of `_eigh` would return an eigenvector without a batch axis
+        # and a tangent with one, which JAX does not accept.
         return matrix[0], jnp.ones_like(matrix)
     return _eigh(matrix)
 
@@ -62,23 +62,24 @@ def _eigh_jvp(primals, tangents):
     values, vectors = _eigh(x)
     inner = vectors.T @ (0.5 * (dx + dx.T)) @ vectors
     gap = values[None, :] - values[:, None]
-    # Within equal eigenvalues the vectors are not determined: they stay.
-    turn = jnp.where(gap == 0, 0, inner / jnp.where(gap == 0, 1, gap))
-    return (values, vectors), (jnp.diagonal(inner), vectors @ turn)
+    # The eigenvectors of equal eigenvalues are not unique. They are not rotated among each
+    # other.
+    rotation = jnp.where(gap == 0, 0, inner / jnp.where(gap == 0, 1, gap))
+    return (values, vectors), (jnp.diagonal(inner), vectors @ rotation)
 
 
-# Sweeps after which the diagonal is taken as it is; five are usual.
+# The largest number of sweeps. Five usually suffice.
 _SWEEPS = 15
 
 
 def _jacobi(
     matrix: Float[Array, "n n"],
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """By Jacobi's rotations, half as many at a time as there are rows.
+    """Eigenvalues and eigenvectors by Jacobi rotations, `n/2` of them at a time.
 
-    In every turn row `k` is paired with row `k + n/2`; then all rows but the first move
-    on by one place, so that each meets every other in a sweep (R. P. Brent and F. T. Luk,
-    1985).
+    Each pass rotates rows `k` and `k + n/2`. All rows but the first then move on by one
+    position. A sweep consists of the `n - 1` passes in which each row is paired with every
+    other one (R. P. Brent and F. T. Luk, 1985).
     """
     size = matrix.shape[0]
     padded = size + size % 2
@@ -89,7 +90,7 @@ def _jacobi(
     moved = np.array([0, *ring[: half - 1], *reversed(ring[half - 1 :])])
     small = float(jnp.finfo(matrix.dtype).eps) ** 2
 
-    def turn(_, carry):
+    def rotate(_, carry):
         x, vectors = carry
         diagonal = jnp.diagonal(x)
         p, q, mixed = diagonal[:half], diagonal[half:], jnp.diagonal(x[:half, half:])
@@ -99,12 +100,12 @@ def _jacobi(
         c = 1 / jnp.sqrt(1 + tangent**2)
         s = tangent * c
 
-        def turned(x):
+        def rotated(x):
             one, other = x[:, :half], x[:, half:]
             columns = [one * c[None] - other * s[None], one * s[None] + other * c[None]]
             return jnp.concatenate(columns, axis=1)[:, moved]
 
-        return turned(turned(x).T).T, turned(vectors)
+        return rotated(rotated(x).T).T, rotated(vectors)
 
     def off(x):
         squares = x * x
@@ -115,12 +116,12 @@ def _jacobi(
 
     def sweep(carry):
         x, vectors, count = carry
-        x, vectors = jax.lax.fori_loop(0, padded - 1, turn, (x, vectors))
+        x, vectors = jax.lax.fori_loop(0, padded - 1, rotate, (x, vectors))
         return x, vectors, count + 1
 
     x = jnp.pad(matrix, (0, padded - size))
     vectors = jnp.eye(padded, dtype=matrix.dtype)
     rough = lambda carry: off(carry[0]) & (carry[2] < _SWEEPS)
     x, vectors, _ = jax.lax.while_loop(rough, sweep, (x, vectors, jnp.array(0)))
-    # A sweep leaves every row, that of the padding too, where it was.
+    # After a sweep every row is in its original position, also that of the padding.
     return jnp.diagonal(x)[:size], vectors[:size, :size]

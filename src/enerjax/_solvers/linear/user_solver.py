@@ -1,4 +1,4 @@
-"""Linear solvers of the user's choice, instead of what size and structure suggest."""
+"""Linear solvers that the user chooses: sparse ones, and those of lineax."""
 
 import abc
 from collections.abc import Callable
@@ -21,10 +21,10 @@ from .dense import AbstractFactors
 
 @dataclass(frozen=True, eq=False)
 class SparsePattern:
-    """Where the entries of a square matrix stand that can differ from zero.
+    """The positions of the structurally nonzero entries of a square matrix.
 
-    Known while a program is traced, and the same for all matrices of a solve. The entries
-    follow each other row by row, and by their columns within a row, as in the CSR format.
+    The pattern is known at trace time and is the same for all matrices of a solve. The
+    entries are sorted by row, and by column within a row, as in the CSR format.
 
     - `size`: the number of rows.
     - `rows`, `columns`: NumPy integers, one for each entry.
@@ -36,58 +36,58 @@ class SparsePattern:
 
     @cached_property
     def row_starts(self) -> np.ndarray:
-        """The number of the first entry of each row, and behind the last row that of all
-        entries: `indptr` of the CSR format, shape `(size + 1,)`."""
+        """The index of the first entry of each row, followed by the number of entries:
+        `indptr` of the CSR format, shape `(size + 1,)`."""
         return np.searchsorted(self.rows, np.arange(self.size + 1))
 
     @cached_property
     def transposed(self) -> "tuple[SparsePattern, np.ndarray]":
-        """The pattern of the transposed matrix, and the order of its entries: they are
-        `entries[order]`."""
+        """The pattern of the transposed matrix, and the permutation `order` for which its
+        entries are `entries[order]`."""
         order = np.lexsort((self.rows, self.columns))
         columns, rows = self.rows[order], self.columns[order]
         return SparsePattern(self.size, rows, columns), order
 
 
 class AbstractSparseSolver(eqx.Module):
-    """A linear solver of your own, for `Newton(linear_solver=...)`.
+    """The base class of sparse linear solvers for `Newton(linear_solver=...)`.
 
-    It is handed the pattern of the matrix and the entries, which are traced. Derivatives of
-    a run take it too: forward ones solve with the Jacobian at the root, reverse ones with
-    its transpose, which is handed over as a matrix of its own with the transposed pattern.
-    So neither method needs a derivative, and both may call foreign code by
-    `jax.pure_callback`. What they do is mapped by `jax.vmap`.
+    Both methods receive the pattern of the matrix. The entries are traced arrays. The
+    solver is used for derivatives of a run too: forward mode solves with the Jacobian at
+    the root, and reverse mode with its transpose, which is passed as another matrix with
+    the transposed pattern. Therefore neither method has to be differentiable, and both may
+    call foreign code by `jax.pure_callback`. Both must support `jax.vmap`.
     """
 
     @abc.abstractmethod
     def factorise(
         self, pattern: SparsePattern, entries: Float[Array, " entries"]
     ) -> PyTree[Array]:
-        """What is kept of a matrix, to solve with it more than once: any tree of arrays.
+        """The factors of a matrix, any tree of arrays, which `solve` may use repeatedly.
 
-        A solver that keeps nothing returns the entries.
+        A solver that does not keep factors returns the entries.
         """
 
     @abc.abstractmethod
     def solve(
         self, pattern: SparsePattern, factors: Any, right: Float[Array, " n"]
     ) -> Float[Array, " n"]:
-        """The solution of `matrix @ x = right`, with what `factorise` has returned.
+        """The solution `x` of `matrix @ x = right`; `factors` are those of `factorise`.
 
-        It must not be finite where the matrix is singular: the run then reports a failure.
-        A solution with a small error costs more iterations, and derivatives have the same
-        relative error.
+        For a singular matrix it must contain values that are not finite; the run then
+        reports a failure. An inaccurate solution costs more iterations, and derivatives
+        have the same relative error.
         """
 
 
 class KLU(AbstractSparseSolver):
-    """Sparse elimination by KLU of SuiteSparse, for equations that fit no narrow band.
+    """Sparse elimination by KLU of SuiteSparse, for Jacobians that are no narrow band.
 
-    Grids, nets and frames with many loops: `Newton(linear_solver=ej.KLU())`. Runs on CPUs,
-    in float64, and needs the extra `sparse` (the package `klujax`, under the LGPL). The
-    matrix is factorised for every correction. KLU stops the whole program with an error
-    where a matrix is singular: such a failure is no value here, and in a batch takes the
-    other lanes with it.
+    Examples are grids, nets and frames with many loops: `Newton(linear_solver=ej.KLU())`.
+    It runs on CPUs, in float64, and needs the extra `sparse` (the package `klujax`, under
+    the LGPL). The matrix is factorised for every correction. If a matrix is singular, KLU
+    stops the whole program with an error. The failure is then not reported as a result, and
+    the other lanes of a batch are lost too.
 
     **Raises:** `ImportError` without the extra.
 
@@ -101,7 +101,7 @@ class KLU(AbstractSparseSolver):
     def factorise(
         self, pattern: SparsePattern, entries: Float[Array, " entries"]
     ) -> Float[Array, " entries"]:
-        # KLU keeps its factors where no loop of JAX can carry them.
+        # The factors of KLU are not arrays, so loops of JAX cannot carry them.
         return entries
 
     def solve(
@@ -121,9 +121,11 @@ def _klujax() -> Any:
     return klujax
 
 
-class Scattered:
-    """How a sparse matrix is stored as a list of its entries. Made while a program is
-    traced; without a `pattern` all entries can differ from zero."""
+class Sparse:
+    """A Jacobian that is stored as the list of its structurally nonzero entries.
+
+    It is constructed at trace time. Without a `pattern` all entries are stored.
+    """
 
     def __init__(self, solver: AbstractSparseSolver, pattern: csr_array | None, size: int):
         if pattern is None:
@@ -141,8 +143,8 @@ class Scattered:
         products = coloured_products(fn, x, self._colours)
         return products[self.pattern.rows, self._colours[self.pattern.columns]]
 
-    def empty(self, size: int, dtype: Any) -> "ScatteredFactors":
-        """Factors of no matrix yet."""
+    def empty(self, size: int, dtype: Any) -> "SparseFactors":
+        """Placeholder factors, of the shapes that `renewed` returns."""
         del size
         entries = jax.ShapeDtypeStruct(self.pattern.rows.shape, dtype)
         by_solver = lambda entries: self.solver.factorise(self.pattern, entries)
@@ -154,42 +156,42 @@ class Scattered:
                     f"arrays; there is a {type(leaf).__name__} in it."
                 )
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), kept)
-        return ScatteredFactors(self.solver, self.pattern, zeros)
+        return SparseFactors(self.solver, self.pattern, zeros)
 
     def solve_transposed(
         self, entries: Float[Array, " entries"], right: Float[Array, " n"]
     ) -> Float[Array, " n"]:
-        """With the transpose of the matrix with these entries."""
+        """The solution with the transpose of the matrix with these entries."""
         pattern, order = self.pattern.transposed
-        factors = ScatteredFactors(self.solver, pattern, None)
+        factors = SparseFactors(self.solver, pattern, None)
         return factors.renewed(entries[order]).solve(right)
 
 
-class ScatteredFactors(AbstractFactors):
-    """What a solver keeps of a sparse matrix."""
+class SparseFactors(AbstractFactors):
+    """The factors that a user's solver keeps of a sparse matrix."""
 
     solver: AbstractSparseSolver
     pattern: SparsePattern = eqx.field(static=True)
     kept: PyTree[Array]
 
-    def renewed(self, matrix: Float[Array, " entries"]) -> "ScatteredFactors":
+    def renewed(self, matrix: Float[Array, " entries"]) -> "SparseFactors":
         kept = self.solver.factorise(self.pattern, matrix)
-        return ScatteredFactors(self.solver, self.pattern, kept)
+        return SparseFactors(self.solver, self.pattern, kept)
 
     def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
         x = self.solver.solve(self.pattern, self.kept, right)
-        told = f"{x.dtype}{list(x.shape)}" if eqx.is_array(x) else type(x).__name__
-        wanted = f"{right.dtype}{list(right.shape)}"
-        if told != wanted:
+        returned = f"{x.dtype}{list(x.shape)}" if eqx.is_array(x) else type(x).__name__
+        expected = f"{right.dtype}{list(right.shape)}"
+        if returned != expected:
             raise ValueError(
-                f"`{type(self.solver).__name__}.solve` must return an array {wanted}, as "
-                f"the right-hand side is, got {told}."
+                f"`{type(self.solver).__name__}.solve` must return an array {expected}, as "
+                f"the right-hand side is, got {returned}."
             )
         return x
 
 
 class LineaxFactors(AbstractFactors):
-    """What a solver of lineax makes of a dense matrix."""
+    """A dense matrix, with which a solver of lineax solves."""
 
     solver: lx.AbstractLinearSolver = eqx.field(static=True)
     matrix: Float[Array, "n n"]
@@ -199,5 +201,5 @@ class LineaxFactors(AbstractFactors):
 
     def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
         operator = lx.MatrixLinearOperator(self.matrix)
-        # What a solver could not solve shows in the corrections of Newton's method.
+        # A failure of the solver is detected by the corrections of Newton's method.
         return lx.linear_solve(operator, right, self.solver, throw=False).value
