@@ -14,7 +14,7 @@ from enerjax._operators import SeparableModel
 from enerjax._solvers import Chord, find_root, Newton, schur, schur_tables
 from enerjax._solvers.linear.blocks import in_blocks
 
-from .helpers import EPS, SCHEMES
+from .helpers import EPS, long, SCHEMES
 
 
 SIZE = 30
@@ -78,7 +78,7 @@ CHORDS = {
 
 
 @pytest.mark.parametrize("name", CHORDS)
-@pytest.mark.parametrize("size", [4, 80])
+@pytest.mark.parametrize("size", [4, pytest.param(80, marks=pytest.mark.slow)])
 def test_without_stiffness_one_correction_solves_the_step(name, size):
     """With a weight for a potential and constant gradients of the constraints."""
     rng = np.random.default_rng(0)
@@ -168,10 +168,12 @@ def test_slow_corrections_are_not_taken_for_round_off(off):
     assert jnp.max(jnp.abs(rest)) <= 100 * EPS  # round-off
 
 
-@pytest.mark.parametrize("name", ["preserving", "decaying", "consistent"])
+@pytest.mark.parametrize(
+    "name", long(["preserving", "decaying", "consistent"], "preserving")
+)
 def test_the_motion_is_that_of_newton_alone(name):
     """A given linear solver is used by Newton's method, without a chord iteration."""
-    system, start, args = ej.problems.chain(3)
+    system, start, args = ej.problems.chain(5)
     run = lambda finder: ej.simulate(
         system, SCHEMES[name](0.5), start, args, h=4e-3, num_steps=50, root_finder=finder
     )

@@ -93,6 +93,7 @@ def test_a_sum_over_elements_is_the_plain_function():
         ej.Elements(3, [[0]])  # pyright: ignore
 
 
+@pytest.mark.slow
 def test_energy_consistent_on_many_elements():
     """The jump is an unknown there, and the stiffness a sum over the rods."""
     num_links = 36

@@ -41,6 +41,7 @@ def test_random_systems_keep_their_laws_and_converge(scheme, n, free):
     assert all(np.isfinite(result.measures["leak"]) for result in results)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scheme", "family"),
     [

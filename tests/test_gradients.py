@@ -92,6 +92,7 @@ def tip(g, steps, save_every):
     return solution.ys.q[-1, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "cut", long([(100, False), (101, False), (103, True)], (100, False), (101, False))
 )

@@ -57,6 +57,7 @@ def test_a_divided_step_keeps_energy_and_constraints():
     assert np.max(np.abs(audit.constraint_rate)) <= 1e-11
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lane", range(3))
 def test_lanes_are_halved_on_their_own(lane):
     alone, together = run(STEPS[lane]), jax.tree.map(lambda x: x[lane], batch())

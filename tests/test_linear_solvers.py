@@ -8,6 +8,7 @@ import pytest
 import enerjax as ej
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver", [*(pytest.param(x, marks=pytest.mark.slow) for x in ("LU", "QR")), "KLU"]
 )

@@ -33,6 +33,7 @@ def against_data():
     )
 
 
+@pytest.mark.slow
 def test_orders_of_the_pendulum():
     table = orders()
     assert table.steps == (40, 80)
@@ -145,6 +146,7 @@ def test_diffrax_on_the_double_pendulum():
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_diffrax_on_a_body_that_rotates():
     diffrax = pytest.importorskip("diffrax")
     term, y = _solved(diffrax, problem("top"), 0.1)

@@ -10,6 +10,7 @@ from enerjax._programs import in_one_function
 from enerjax._programs.tracing import programs_within
 from enerjax._solvers import eigh, find_root, Newton
 
+from .helpers import long
 from .test_one_function import is_marked, pytestmark, X
 
 
@@ -135,10 +136,11 @@ def lanes_by_hand(fn, axes):
 
 
 @pytest.mark.parametrize("jit", [pytest.param(False, marks=pytest.mark.slow), True])
-@pytest.mark.parametrize("axes", BATCHED.values(), ids=BATCHED)
+@pytest.mark.parametrize("axes", long(BATCHED, "first", "second"))
 @pytest.mark.parametrize("name", ["one_step", pytest.param("run", marks=pytest.mark.slow)])
 def test_derivatives_of_batches(name, axes, jit):
     """Values, too: JAX compares neither with those of the function alone."""
+    axes = BATCHED[axes]
     fn = FUNCTIONS[name]
     point = tuple(a if axis == 0 else a[0] for a, axis in zip((XS, YS), axes, strict=True))
     along = jax.tree.map(lambda x: jnp.cos(x), point)

@@ -157,6 +157,7 @@ def test_derivatives_of_a_rod_that_is_declared_twice():
     assert reverse == pytest.approx(float(change), rel=1e-7)  # truncation
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "scheme", ["preserving index3", pytest.param("decaying", marks=pytest.mark.slow)]
 )

@@ -8,6 +8,7 @@ import pytest
 import enerjax as ej
 from enerjax._programs import in_one_function
 
+from .helpers import long
 from .test_one_function import is_marked, pytestmark
 
 
@@ -86,7 +87,9 @@ def test_rewritten_programs_have_the_same_values_and_derivatives(name):
     jax.tree.map(close, numbers(jax.jit(lambda: seen(other))()), numbers(seen(fn)))
 
 
-@pytest.mark.parametrize("name", ["four_bar", "car_axis", "heavy_top_directors"])
+@pytest.mark.parametrize(
+    "name", long(["four_bar", "car_axis", "heavy_top_directors"], "four_bar", "car_axis")
+)
 def test_scenes_are_one_function(name):
     system, start, args = getattr(ej.problems, name)()
     run = lambda args: ej.simulate(

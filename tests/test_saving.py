@@ -93,6 +93,7 @@ def test_a_number_of_steps_has_rows_at_times_too():
     np.testing.assert_allclose(counted.audit.dissipated, sums, rtol=0, atol=100 * EPS)
 
 
+@pytest.mark.slow
 def test_derivatives_pass_through_a_function_of_the_state():
     system, start, args = problem("pendulum")
 

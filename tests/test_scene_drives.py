@@ -73,6 +73,7 @@ def crank_run():
     )
 
 
+@pytest.mark.slow
 def test_a_driven_slider_crank_moves_as_its_closed_form():
     scene, run, *_ = crank_run()
     t = jnp.asarray(run.ts)

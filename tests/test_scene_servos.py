@@ -65,6 +65,7 @@ def test_a_servo_moves_an_arm_as_in_its_minimal_coordinate():
     assert slopes(error)[0] == pytest.approx(2, abs=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "body",
     [ej.bodies.RigidBody, pytest.param(ej.bodies.QuaternionBody, marks=pytest.mark.slow)],

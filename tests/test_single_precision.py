@@ -32,7 +32,9 @@ def run(name, dtype):
     return ej.simulate(system, scheme, start, args, h=h, num_steps=STEPS)
 
 
-@pytest.mark.parametrize("name", long(RUNS, "decaying", "composed", "top", "chain"))
+@pytest.mark.parametrize(
+    "name", long(RUNS, "preserving", "decaying", "composed", "top", "chain")
+)
 def test_energy_and_constraints_hold_to_the_round_off_of_the_dtype(name):
     single, double = run(name, jnp.float32), run(name, jnp.float64)
     assert single.ys.q.dtype == single.audit.energy.dtype == jnp.float32
@@ -53,6 +55,7 @@ def test_energy_and_constraints_hold_to_the_round_off_of_the_dtype(name):
     assert iterations[0] <= iterations[1] + 0.5
 
 
+@pytest.mark.slow
 def test_derivatives_in_single_precision():
     system, start, args = ej.problems.pendulum()
 

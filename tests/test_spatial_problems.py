@@ -84,6 +84,7 @@ def check_tethered(solution, rows, position, rotation):
     assert leak(solution) <= 1e-12
 
 
+@pytest.mark.slow
 def test_the_tethered_body_swings_as_published():
     # Truncation, measured: 2.7e-7 and 8e-6.
     check_tethered(run("tethered_body", 2e-3, 500, 500), TETHERED[:1], 4e-7, 1.2e-5)

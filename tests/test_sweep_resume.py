@@ -159,6 +159,7 @@ def compare(file):
             np.testing.assert_allclose(found[name], expected, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_killed_sweep_is_resumed_on_other_devices(tmp_path):
     folder, result = tmp_path / "sweep", tmp_path / "result.npz"
     killed = process(result, "--path", folder, "--die-after", 16)

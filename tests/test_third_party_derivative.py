@@ -53,6 +53,7 @@ def test_it_keeps_the_energy_and_converges_to_the_motion():
     assert 1e-7 < off < 1e-3  # truncation, of order 2
 
 
+@pytest.mark.slow
 def test_it_is_differentiated():
     slope = jax.grad(lambda g: height(g, 20).ys.q[-1, 1])(9.81)
     eps = 1e-5

@@ -91,6 +91,7 @@ def test_its_gap_is_told_and_closed():
         incline(off=0.2)
 
 
+@pytest.mark.slow
 def test_it_is_differentiated_and_mapped():
     """How far the wheel has come, by its inertia, in closed form."""
     args = incline().args
@@ -172,6 +173,7 @@ class Pin(ej.joints.AbstractJoint):
         return PinRows(), ends.points([0.0] * 3, None) | ends.axes(self.axis)
 
 
+@pytest.mark.slow
 def test_a_hinge_of_ones_own_takes_torsion_springs_and_drives():
     """A torsion balance, in closed form: the axis is vertical and through the centre."""
     inertia, stiffness = 0.25, 3.0

@@ -13,7 +13,7 @@ import scipy.sparse.linalg
 import enerjax as ej
 
 from .block_tridiagonal import along_chain
-from .helpers import HERE, imported
+from .helpers import HERE, imported, long
 
 
 NUM_LINKS = 20
@@ -75,7 +75,7 @@ def expected():
     return pushed(9.81, None)
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", long(SOLVERS, "scipy"))
 def test_the_motion_and_its_derivatives_are_those_of_the_default(name, expected):
     solver = SOLVERS[name]
     q, rate = pushed(9.81, solver)
@@ -85,7 +85,7 @@ def test_the_motion_and_its_derivatives_are_those_of_the_default(name, expected)
     assert pulled == pytest.approx(float(expected[1][-1]), rel=1e-9)  # solver
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", long(SOLVERS, "scipy"))
 def test_lanes_of_a_batch_are_solved_apart(name):
     gs = jnp.array([5.0, 9.81])
     lanes = jax.jit(jax.vmap(lambda g: end(g, SOLVERS[name])))(gs)

@@ -51,6 +51,7 @@ def compare(batch, number, solution):
 AXES = {"alpha": (0,), "h": (1,), "args": (2,), "start": (3, 4), "all": (0, 1, 2, 3, 4)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("swept", long(AXES, "alpha", "start"))
 def test_vmap_equals_a_loop(swept):
     numbers = lanes()

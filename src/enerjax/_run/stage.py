@@ -42,6 +42,9 @@ MAX_ITERATIONS = 50
 # (stiff forces, fast rotations) usually last for several steps, and each attempt costs a
 # few evaluations of the residual.
 _CHORD_WAITS = 10
+# Up to this number of unknowns Newton's method is about as fast as the chord method in short
+# steps, and faster in long ones, where the chord method needs more corrections.
+_FEW = 16
 
 
 class Memory(eqx.Module):
@@ -104,9 +107,13 @@ def first_memory(
     flight = _free_flight(scheme, problem, model, start)
     added = jax.tree.map(lambda x, x0: jnp.stack([x - x0] * 3), z, flight)
     added = jax.lax.stop_gradient(added)
-    is_chord_scheme = isinstance(scheme, AbstractSchemeWithChord)
-    has_chord = with_chord and is_chord_scheme and model.has_constraint_matrix
     flat, _ = ravel_pytree(flight)
+    has_chord = (
+        with_chord
+        and flat.size > _FEW
+        and isinstance(scheme, AbstractSchemeWithChord)
+        and model.has_constraint_matrix
+    )
     factors = None if has_chord else kept_factors(flat.size, flat.dtype)
     return Memory(
         added=added,
