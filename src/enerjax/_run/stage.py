@@ -42,8 +42,8 @@ MAX_ITERATIONS = 50
 # (stiff forces, fast rotations) usually last for several steps, and each attempt costs a
 # few evaluations of the residual.
 _CHORD_WAITS = 10
-# Up to this number of unknowns Newton's method is about as fast as the chord method in short
-# steps, and faster in long ones, where the chord method needs more corrections.
+# Up to this number of unknowns Newton's method is about as fast as the chord method in
+# short steps, and faster in long ones, where the chord method needs more corrections.
 _FEW = 16
 
 
