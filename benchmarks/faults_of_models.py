@@ -8,8 +8,9 @@ FAULTS = (
     Fault(
         "projection: without the inertia",
         "_analysis/projection.py",
-        "        force = metric @ shift + pull(mu)[0]\n        return force / (size",
-        "        force = coordinate**2 * shift + pull(mu)[0]\n        return force / (size",
+        "        force = metric @ shift + transpose(mu)[0]\n        return force / (size",
+        "        force = coordinate**2 * shift + transpose(mu)[0]\n"
+        "        return force / (size",
         "A start moves by the smallest change in the diagonal of the inertia only.",
         of("initial::test_the_smallest_change_in_an_inertia_that_couples_the_coordinates"),
     ),
@@ -32,8 +33,8 @@ FAULTS = (
     Fault(
         "equilibrium: multipliers in another unit",
         "_analysis/equilibrium.py",
-        "    multipliers = size * tension / scales.constraint\n",
-        "    multipliers = size * tension\n",
+        "    multipliers = size * scaled_multipliers / scales.constraint\n",
+        "    multipliers = size * scaled_multipliers\n",
         "Multipliers of an equilibrium lack the unit of their constraint.",
         of("analysis::test_a_hanging_chain_rests_in_the_catenary_polygon"),
     ),
@@ -48,8 +49,8 @@ FAULTS = (
     Fault(
         "modes: no geometric stiffness",
         "_analysis/modes.py",
-        "    strain = lambda q: energy(q) + multipliers @ held(q)\n",
-        "    strain = lambda q: energy(q) + 0 * multipliers @ held(q)\n",
+        "    augmented = lambda q: potential(q) + multipliers @ constraint(q)\n",
+        "    augmented = lambda q: potential(q) + 0 * multipliers @ constraint(q)\n",
         "Tensions of rods do not stiffen a hanging chain.",
         of("analysis::test_modes_of_a_hanging_chain"),
     ),
@@ -96,7 +97,7 @@ FAULTS = (
     ),
     Fault(
         "hinges: all joints share every axis",
-        "scenes/_hinges.py",
+        "scenes/_ends.py",
         "        return float(np.linalg.norm(np.cross(self.axis, axis))) <= _PARALLEL\n",
         "        return True\n",
         "An angle about an axis that a hinge does not keep is accepted.",
@@ -111,15 +112,15 @@ FAULTS = (
         '        return b.direction(numbers["value"])\n',
         '        return numbers["value"]\n',
         "A force that turns with its body keeps its direction in space.",
-        of("scene_forces::test_forces_that_a_program_gives_follow_their_closed_forms"),
+        of("scene_forces::test_forces_that_functions_define_follow_closed_forms"),
     ),
     Fault(
         "springs: the angle of rest in the plane",
         "scenes/forces.py",
-        'law, start = Elastic(PlanarTurn(), "angle"), ends.turn()',
-        'law, start = Elastic(PlanarTurn(), "angle"), 0.0 * ends.turn()',
+        'law, start = Elastic(PlanarTurn(), "angle"), ends.relative_angle()',
+        'law, start = Elastic(PlanarTurn(), "angle"), 0.0 * ends.relative_angle()',
         "A torsion spring in the plane is relaxed at angle zero and not at the start.",
-        of("scenes::test_forces_have_the_energies_that_they_say"),
+        of("scenes::test_forces_have_the_stated_energies"),
     ),
     Fault(
         "drives: half a turn is not missed",
@@ -135,7 +136,7 @@ FAULTS = (
         "slope = 2 * found.value if",
         "slope = found.value if",
         "The force of a rod is half of what it is.",
-        of("scene_servos::test_lengths_and_forces_are_those_by_hand"),
+        of("scene_servos::test_lengths_and_forces_equal_those_computed_by_hand"),
     ),
     Fault(
         "measures: turns between rows",
@@ -151,7 +152,9 @@ FAULTS = (
         "    pivot = pivot_of(b, numbers)\n",
         "    pivot = b.origin\n",
         "The torque of a joint is that about the mass centre of its second body.",
-        of("joints::test_a_joint_leaves_its_own_freedom_and_carries_the_rest"),
+        of(
+            "joints::test_a_joint_leaves_its_degrees_of_freedom_and_carries_all_other_loads"
+        ),
     ),
     Fault(
         "gaps: an arc in another unit",
@@ -159,7 +162,7 @@ FAULTS = (
         "turn / size",
         "turn * size",
         "A gap in an angle is measured in the wrong unit.",
-        of("scenes::test_what_is_off_a_little_is_reported_and_closed"),
+        of("scenes::test_a_small_gap_is_reported_and_closed"),
     ),
     # Problems ---------------------------------------------------------------------------
     Fault(
@@ -203,7 +206,7 @@ FAULTS = (
         "Intervals hold 90 % instead of 95 %.",
         of(
             "identification::test_estimate_and_covariance_of_an_independent_program",
-            "identification::test_intervals_hold_what_they_promise",
+            "identification::test_confidence_intervals_contain_the_truth_as_often_as_they_claim",
         ),
     ),
     Fault(
@@ -212,6 +215,6 @@ FAULTS = (
         "(_FINER[1] / _FINER[0]) ** order - 1",
         "(_FINER[1] / _FINER[0]) ** order",
         "Richardson's extrapolation stops short.",
-        of("measure::test_the_extrapolated_reference_is_as_good_as_given_data"),
+        of("measure::test_the_extrapolated_reference_is_as_good_as_exact_data"),
     ),
 )

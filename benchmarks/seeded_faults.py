@@ -33,7 +33,9 @@ FAULTS: tuple[Fault, ...] = (*OF_SCHEMES, *OF_RUNS, *OF_MODELS)
 PROJECT = Path(__file__).parent.parent
 # Of the project, what tests read.
 _NEEDED = ("src", "tests", "benchmarks", "docs", "notebooks", "README.md", "pyproject.toml")
-_PYTEST = ("-m", "pytest", "-x", "-q", "-p", "no:cacheprovider")
+# The test that faults can be seeded fails wherever one is.
+_OF_THE_LIST = "tests/test_conventions.py::test_every_seeded_fault_can_be_seeded"
+_PYTEST = ("-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--deselect", _OF_THE_LIST)
 # Seconds after which the tests of a fault are given up, and a whole suite.
 _LIMIT, _LIMIT_OF_ALL = 180, 3600
 
@@ -125,7 +127,7 @@ def tried(fault: Fault, copy: Path, *, everything: bool) -> Finding:
         return _finding(fault, "gone", "", begin)
     file.write_text(text.replace(fault.old, fault.new))
     try:
-        outcome, test = _tested(copy, ["-n", "0", *fault.tests], _LIMIT)
+        outcome, test = _tested(copy, ["-n", "0", "-m", "", *fault.tests], _LIMIT)
         if everything and outcome != "caught":
             outcome, test = _tested(copy, [], _LIMIT_OF_ALL)
     finally:

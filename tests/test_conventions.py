@@ -283,3 +283,16 @@ def test_public_methods_have_a_docstring():
         for name, method in vars(value).items():
             if isinstance(method, classmethod) and not name.startswith("_"):
                 assert method.__doc__, f"{value.__name__}.{name}"
+
+
+def test_every_seeded_fault_can_be_seeded():
+    """Its text stands once in the sources, and the tests that ought to notice it exist."""
+    import seeded_faults
+
+    assert len({fault.name for fault in seeded_faults.FAULTS}) == len(seeded_faults.FAULTS)
+    for fault in seeded_faults.FAULTS:
+        assert (PACKAGE / fault.file).read_text().count(fault.old) == 1, fault.name
+        for place in fault.tests:
+            file, _, test = place.partition("::")
+            text = (TESTS[0].parent.parent / file).read_text()
+            assert f"def {test.partition('[')[0]}(" in text if test else text, fault.name
