@@ -169,7 +169,7 @@ def test_slow_corrections_are_not_taken_for_round_off(off):
 
 
 @pytest.mark.parametrize(
-    "name", long(["preserving", "decaying", "consistent"], "preserving")
+    "name", long(["preserving", "decaying", "consistent"], "preserving", "consistent")
 )
 def test_the_motion_is_that_of_newton_alone(name):
     """A given linear solver is used by Newton's method, without a chord iteration."""

@@ -198,6 +198,7 @@ def arm_potential(q, args):
     return -9.81 * (2 * jnp.cos(q[0]) + jnp.cos(q[1]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("damping", "order"), [pytest.param(0.3, 2, marks=pytest.mark.slow), (0.0, 4)]
 )

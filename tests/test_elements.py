@@ -49,6 +49,7 @@ def _net(size, declared=False):
     return system, ej.initial_state(system, rest.ravel(), np.zeros(rest.size), args), args
 
 
+@pytest.mark.slow
 def test_a_net_with_loops():
     system, start, args = _net(6)
     assert isinstance(system.kinetic, BlockDiagonal)

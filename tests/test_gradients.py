@@ -115,6 +115,7 @@ def memory_of_the_reverse_pass(steps):
     return memory.temp_size_in_bytes
 
 
+@pytest.mark.slow
 def test_memory_of_the_reverse_pass():
     # Four unknowns a step: 8 bytes each, and the rest for the states in a segment.
     growth = memory_of_the_reverse_pass(3000) - memory_of_the_reverse_pass(1000)
@@ -152,6 +153,7 @@ def test_the_start_moves_along_the_constraints():
         np.testing.assert_allclose(leaf, 0, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_gradients_of_a_rigid_body():
     system, start, args = problem("body")
 

@@ -30,6 +30,7 @@ def wheel():
 OMEGA = np.logspace(-3, 4, 8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "scheme",
     [

@@ -37,6 +37,7 @@ def arm():
     )
 
 
+@pytest.mark.slow
 def test_a_servo_moves_an_arm_as_in_its_minimal_coordinate():
     scene = arm()
     system, start, args = scene.build()

@@ -113,6 +113,7 @@ for derivative in (ej.Gonzalez(), ej.MeanValue()):
 """
 
 
+@pytest.mark.slow
 def test_a_program_of_one_function_has_the_same_name_in_every_process():
     """And another where only what is inside of one function differs."""
     found = []

@@ -131,6 +131,7 @@ class Cross(ej.joints.AbstractJoint):
         return CrossRows(), ends.points(self.point_a, None) | axes
 
 
+@pytest.mark.slow
 def test_a_universal_joint_is_the_built_in_one():
     runs, x, y = [], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
     for joint in (Cross, ej.joints.Universal):
@@ -270,6 +271,7 @@ def test_a_drag_of_ones_own_slows_down_and_its_work_is_in_the_audit():
 # A body ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_body_from_its_sides_tumbles_as_euler_says():
     spin = [0.1, 2.0, 0.2]
     box = cuboid("box", 3.0, [0.2, 0.5, 0.9], [0.0] * 3, angular_velocity=spin)

@@ -93,6 +93,7 @@ def test_lanes_of_a_batch_are_solved_apart(name):
     np.testing.assert_allclose(lanes, alone, atol=1e-12)  # solver
 
 
+@pytest.mark.slow
 def test_few_unknowns_go_to_the_given_solver_too():
     """Which the default solves densely: the solver is given, and is used."""
     sizes = []
