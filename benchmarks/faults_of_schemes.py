@@ -226,7 +226,7 @@ FAULTS = (
         "    mixed = (rows > 0) != (columns > 0)\n",
         "    mixed = (rows > 0) & (columns < -jnp.inf)\n",
         "Derivatives are wrong where a stiffness has eigenvalues of both signs.",
-        of("gradients::test_forward_reverse_and_differences_agree"),
+        of("gradients::test_derivatives_where_the_stiffness_has_eigenvalues_of_both_signs"),
     ),
     Fault(
         "rattle: multipliers of the start",
@@ -234,7 +234,7 @@ FAULTS = (
         "0.5 * (z.impulse + z.velocity_impulse) / problem.h",
         "z.impulse / problem.h",
         "The multipliers that are reported are those of the start of the step.",
-        of("baselines::test_rattle_is_the_published_method"),
+        of("baselines::test_multipliers_of_rattle_are_those_of_the_middle_of_the_step"),
     ),
     Fault(
         "generalized alpha: the method of HHT",
@@ -242,7 +242,7 @@ FAULTS = (
         "0.25 * (1 - alpha) ** 2, 0.5 - alpha",
         "0.25 * (1 + alpha) ** 2, 0.5 - alpha",
         "The method of Hilber, Hughes and Taylor has a wrong beta.",
-        of("baselines::test_generalized_alpha_is_the_published_method"),
+        of("baselines::test_hht_shrinks_fast_oscillations_by_its_published_limit"),
     ),
     Fault(
         "composed: two stages exchanged",

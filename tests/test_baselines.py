@@ -188,6 +188,37 @@ def test_fast_oscillations_shrink_by_the_spectral_radius():
     np.testing.assert_allclose(shrink, rho, rtol=2e-2)
 
 
+def test_hht_shrinks_fast_oscillations_by_its_published_limit():
+    """By (1 + alpha)/(1 - alpha): J. Chung and G. M. Hulbert (1993)."""
+    system = ej.System(jnp.eye(1), lambda q, args: 0.5 * args["k"] * q @ q)
+    start, args = ej.State(jnp.ones(1), jnp.zeros(1)), dict(k=1.0)
+
+    @jax.vmap
+    def speeds(alpha):
+        method = ej.GeneralizedAlpha.hht(alpha)
+        return ej.simulate(system, method, start, args, h=1e4, num_steps=100).ys.v[:, 0]
+
+    alpha = np.array([-0.2, -0.1])
+    v = np.abs(np.asarray(speeds(jnp.asarray(alpha))))
+    # A double root, as above.
+    shrink = (v[:, 40] / v[:, 20] / 2) ** (1 / 20)
+    np.testing.assert_allclose(shrink, (1 + alpha) / (1 - alpha), rtol=2e-2)
+
+
+def test_multipliers_of_rattle_are_those_of_the_middle_of_the_step():
+    """With an error of second order; those of its start are off by the first."""
+    system, start, args = problem("pendulum")
+    errors = []
+    for steps in (50, 100):
+        sol = ej.simulate(system, ej.Rattle(), start, args, h=1 / steps, num_steps=steps)
+        accelerations = jax.vmap(
+            lambda q, v: ej.consistent_start(system, q, v, args).multipliers
+        )(sol.ys.q, sol.ys.v)
+        middle = 0.5 * (accelerations[1:] + accelerations[:-1])
+        errors.append(np.max(np.abs(sol.multipliers[1:] - middle)))
+    assert errors[0] / errors[1] == pytest.approx(4, rel=0.2)  # truncation, of order 2
+
+
 def test_newmark_is_the_trapezoidal_rule():
     """Which conserves the energy of a linear oscillator."""
     system = ej.System(jnp.eye(1), lambda q, args: 0.5 * args["k"] * q @ q)
