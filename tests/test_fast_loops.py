@@ -39,6 +39,7 @@ def runs():
     return [_in_a_process(RUN.format(x)) for x in ("", "ej.enable_fast_loops()")]
 
 
+@pytest.mark.slow
 def test_no_call_interrupts_the_loops_of_a_run(runs):
     assert all(run.returncode == 0 for run in runs), [run.stderr for run in runs]
     slow, fast = (run.stdout.split() for run in runs)

@@ -170,6 +170,7 @@ def test_the_slider_crank_moves_as_in_its_one_coordinate():
     assert leak(solution) <= 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "steps"),
     [("four_bar", 500), pytest.param("spatial_four_bar", 500, marks=pytest.mark.slow)],
