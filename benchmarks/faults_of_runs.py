@@ -11,7 +11,7 @@ FAULTS = (
         "jnp.where(sizes == jnp.max(sizes), numbers, num_rows - 1)",
         "jnp.where(sizes > 0, numbers, num_rows - 1)",
         "The elimination of narrow bands takes the first pivot that is not zero.",
-        of("large_systems::test_a_shuffled_band_is_found_and_solved"),
+        of("large_systems::test_a_band_is_cut_into_the_blocks_that_it_is_made_of"),
     ),
     Fault(
         "band: colours of a dense matrix",

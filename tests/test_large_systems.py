@@ -234,8 +234,10 @@ def test_a_chain_that_cracks_like_a_whip_keeps_energy_and_constraints(num_links)
     assert np.max(np.abs(run.audit.constraint_rate)) <= 1e-9 * length**2
 
 
-def test_a_band_is_cut_into_the_blocks_that_it_is_made_of():
-    """Blocks as wide as the band would be of seven unknowns."""
+@pytest.mark.parametrize("diagonal", [True, False])
+def test_a_band_is_cut_into_the_blocks_that_it_is_made_of(diagonal):
+    """Blocks as wide as the band would be of seven unknowns; rows must be exchanged where
+    the diagonal is small."""
     neighbours = np.abs(np.subtract.outer(np.arange(30), np.arange(30))) <= 1
     rng = np.random.default_rng(0)
     order = rng.permutation(120)
@@ -243,6 +245,7 @@ def test_a_band_is_cut_into_the_blocks_that_it_is_made_of():
     band = Band(csr_array(pattern != 0))
     assert band.width == 4
     matrix = pattern * rng.normal(size=pattern.shape)
+    matrix = matrix if diagonal else matrix * (1 - (1 - 1e-12) * np.eye(120))
     entries = band.evaluate(lambda x: jnp.asarray(matrix) @ x, jnp.zeros(120))
     right = rng.normal(size=120)
     x = band.empty(120, float).renewed(entries).solve(jnp.asarray(right))
