@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from enerjax._programs.sparsity.columns import columns_along, jacobian_columns
+from enerjax._programs.sparsity.jacobian_columns import columns_along, jacobian_columns
 from enerjax._solvers.linear.dense import inverse
 
 

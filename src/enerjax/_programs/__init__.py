@@ -2,12 +2,11 @@
 
 from . import primitives as primitives
 from .fast_loops import enable_fast_loops as enable_fast_loops
-from .indices import Indices as Indices
 from .lanes import in_any_lane as in_any_lane
 from .one_function.calls import in_one_function as in_one_function, unmerged as unmerged
 from .one_function.possible import LARGEST_SUM as LARGEST_SUM
 from .one_function.products import plain_products as plain_products, summed as summed
-from .sparsity.columns import (
+from .sparsity.jacobian_columns import (
     columns_along as columns_along,
     jacobian_columns as jacobian_columns,
 )
@@ -16,6 +15,7 @@ from .sparsity.pattern import (
     LARGE as LARGE,
     shape_of as shape_of,
 )
+from .static_indices import Indices as Indices
 from .tracing import (
     evaluate as evaluate,
     function_with_own_derivative as function_with_own_derivative,

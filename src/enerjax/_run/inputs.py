@@ -23,7 +23,7 @@ from .._system import (
 )
 from .._types import Args, Real, Scalar
 from ..schemes import AbstractScheme
-from .derivative_check import check_derivatives
+from .discrete_gradient_check import check_derivatives
 
 
 def prepare(

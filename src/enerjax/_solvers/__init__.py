@@ -45,4 +45,4 @@ from .linear.user_solver import (
 from .newton import Newton as Newton
 from .newton_iterations import max_norm as max_norm
 from .root import find_root as find_root, ROOT as ROOT
-from .search import Chord as Chord, Root as Root, RootFinder as RootFinder
+from .root_search import Chord as Chord, Root as Root, RootFinder as RootFinder

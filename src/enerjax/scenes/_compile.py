@@ -17,7 +17,7 @@ from ._frames import Frame, GROUND, Numbers
 from ._law_checks import resolved_part
 from ._layout import Layout, Link, numbers_of
 from ._parameters import Parameters
-from ._view import View
+from ._pose_view import View
 from .bodies import AbstractBody
 from .drives import AbstractDrive
 from .forces import AbstractForce, Potential

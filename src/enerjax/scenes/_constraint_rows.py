@@ -9,8 +9,8 @@ from .._types import Coordinates, Real
 from ._functions import constraint, driven, drives_at, redundancy
 from ._layout import Layout
 from ._parameters import Parameters
+from ._pose_view import evaluate, View
 from ._user_functions import vector_of
-from ._view import evaluate, View
 
 
 def members(layout: Layout) -> list[tuple[str, ...]]:

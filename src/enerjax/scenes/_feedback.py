@@ -12,7 +12,7 @@ from ._laws import AbstractConstraintLaw, AbstractForceLaw, AbstractSpringLaw, D
 from ._layout import Layout, Links
 from ._measures import AbstractMeasure
 from ._parameters import Parameters
-from ._view import evaluate, lift, View
+from ._pose_view import evaluate, lift, View
 
 
 class Moving(View):

@@ -15,8 +15,8 @@ from ._feedback import Moving
 from ._laws import AbstractForceLaw, Acting, Driven
 from ._layout import Layout, Links
 from ._parameters import Parameters
+from ._pose_view import evaluate, lift, rows, View
 from ._user_functions import ask, vector_of
-from ._view import evaluate, lift, rows, View
 
 
 def make_system(layout: Layout, over_constrained: bool) -> System:

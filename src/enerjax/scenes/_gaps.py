@@ -15,9 +15,9 @@ from ._laws import Driven, Length, Missed
 from ._layout import Layout, Links
 from ._measures import Separation, Slide
 from ._parameters import Parameters
+from ._pose_view import evaluate, View
 from ._relative_motions import moved, no_motion, pivot_of
 from ._user_functions import vector_of
-from ._view import evaluate, View
 
 
 class Gap(NamedTuple):

@@ -24,7 +24,7 @@ from ._layout import Layout, Links
 from ._measures import AbstractLaw
 from ._parameters import Parameters
 from ._part import AbstractForce
-from ._view import evaluate, View
+from ._pose_view import evaluate, View
 from .joints import AbstractJoint
 
 

@@ -12,7 +12,7 @@ from ._frames import Frame, Numbers, Point
 from ._laws import Driven
 from ._layout import Layout, Links
 from ._parameters import Parameters
-from ._view import View
+from ._pose_view import View
 
 
 class Reaction(NamedTuple):

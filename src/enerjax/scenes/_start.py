@@ -18,7 +18,7 @@ from ._laws import Driven, Missed
 from ._layout import Layout
 from ._measures import Turn
 from ._parameters import Parameters
-from ._view import evaluate, lift, View
+from ._pose_view import evaluate, lift, View
 
 
 # A gap that is larger than this fraction of the bodies, or of their speed, is a mistake;

@@ -19,11 +19,11 @@ from ._functions import make_system
 from ._gaps import Gap, Measured
 from ._law_checks import check_laws
 from ._parameters import Parameters
+from ._pose_view import View
 from ._readouts import measured_along, Readout
 from ._relative_motions import each, Reaction, reaction
 from ._start import check_poses, closed_start, gaps_of, PartialStart
 from ._summary import summary
-from ._view import View
 from .bodies import AbstractBody
 from .drives import AbstractDrive
 from .forces import AbstractForce
