@@ -53,31 +53,32 @@ class SchurTables(Indices):
     """
 
     def __init__(self, pattern: csr_array, weight: Symmetric):
-        super().__init__(pattern.toarray().astype(bool))
         self.num_rows, size = shape_of(pattern)
         is_blocks = isinstance(weight, BlockDiagonal)
         blocks = weight.places.rows if is_blocks else np.arange(size)[None]
-        self.colours = column_colours(pattern, np.arange(size))
         rows, columns = pattern.nonzero()
-        incidence = np.zeros((self.num_rows, len(blocks)), bool)
+        super().__init__(np.concatenate([rows, columns, blocks.ravel(), blocks.shape]))
+        self.colours = column_colours(pattern, np.arange(size))
         label = np.zeros(size + 1, int)
         label[blocks.ravel()] = np.repeat(np.arange(len(blocks)), blocks.shape[1])
-        incidence[rows, label[columns]] = True
-        segments = max(int(incidence.sum(axis=1).max(initial=0)), 1)
-        self.touched = np.full((self.num_rows, segments), len(blocks))
-        for row, touched in zip(self.touched, incidence, strict=True):
-            row[: touched.sum()] = np.flatnonzero(touched)
+        shape = self.num_rows, len(blocks)
+        incidence = csr_array((np.ones(rows.size), (rows, label[columns])), shape=shape)
+        counts = np.diff(incidence.indptr)
+        within = np.arange(incidence.nnz) - np.repeat(incidence.indptr[:-1], counts)
+        self.touched = np.full((self.num_rows, max(counts.max(initial=0), 1)), len(blocks))
+        self.touched[np.repeat(np.arange(self.num_rows), counts), within] = (
+            incidence.indices
+        )
         none = np.full((1, blocks.shape[1]), size)
         self.columns = np.concatenate([blocks, none])[self.touched]
-        self._find_entries(pattern, size)
-        self._cut(csr_array(incidence.astype(float)))
+        self._find_entries(rows, columns, size)
+        self._cut(incidence)
 
-    def _find_entries(self, pattern: csr_array, size: int) -> None:
+    def _find_entries(self, rows: np.ndarray, columns: np.ndarray, size: int) -> None:
         num_colours = int(self.colours.max(initial=0)) + 1
-        nonzero = np.zeros((self.num_rows, size + 1), bool)
-        nonzero[pattern.nonzero()] = True
         row = np.arange(self.num_rows)[:, None, None]
-        known = nonzero[row, self.columns]
+        number = lambda row, column: row * (size + 1) + column
+        known = np.isin(number(row, self.columns), number(rows, columns))
         place = row * num_colours + np.append(self.colours, 0)[self.columns]
         self.entries = np.where(known, place, self.num_rows * num_colours)
         places, columns = np.flatnonzero(known), self.columns[known]
@@ -110,21 +111,18 @@ class SchurTables(Indices):
         `(2, pairs, width, columns)`. Indices of absent entries are one past the end.
         """
         size, none = self.transposed.shape[0], self.columns.size
-        places = np.full((self.num_rows + 1, size + 1), none)
-        places[np.arange(self.num_rows)[:, None, None], self.columns] = np.arange(
-            none
-        ).reshape(self.columns.shape)
-        places[:, size] = none
-        touched = places < none
-        shared = [
-            np.flatnonzero(touched[a].any(axis=0) & touched[b].any(axis=0))
-            for a, b in pairs
-        ]
+        # One more row for the absent rows of short blocks.
+        columns = self.columns.reshape(self.num_rows, -1)
+        columns = np.pad(columns, ((0, 1), (0, 0)), constant_values=size)
+        in_both = lambda a, b: np.intersect1d(columns[a], columns[b])
+        shared = [found[found < size] for found in (in_both(*pair) for pair in pairs)]
         max_shared = max(map(len, shared), default=0)
         table = np.full((2, len(pairs), self.width, max_shared), none)
-        for k, (sides, columns) in enumerate(zip(pairs, shared, strict=True)):
+        for k, (sides, found) in enumerate(zip(pairs, shared, strict=True)):
             for side, rows in enumerate(sides):
-                table[side, k, :, : columns.size] = places[rows][:, columns]
+                row, entry = np.nonzero(np.isin(columns[rows], found))
+                at = np.searchsorted(found, columns[rows][row, entry])
+                table[side, k, row, at] = rows[row] * columns.shape[1] + entry
         return table
 
 
