@@ -7,6 +7,7 @@ and `march` has one program for all numbers of steps.
 import ast
 import functools
 import pathlib
+import re
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
@@ -21,6 +22,19 @@ import enerjax as ej
 
 EPS = float(np.finfo(float).eps)
 HERE = pathlib.Path(__file__).parent
+
+
+_BLOCK = re.compile(r"^```python([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+def code_blocks(page):
+    """The Python code of a page as pairs of a mark and a source, in order."""
+    return [(mark.strip(), code) for mark, code in _BLOCK.findall(page.read_text())]
+
+
+def code_of(page):
+    """The Python code of a page of the documentation, block by block."""
+    return [code for _, code in code_blocks(HERE.parent / "docs" / page)]
 
 
 def imported(name):
@@ -87,6 +101,21 @@ def long(names, *slow):
     assert set(slow) <= set(names)
     mark = [pytest.mark.slow]
     return [pytest.param(x, marks=mark if x in slow else []) for x in names]
+
+
+def chain_end(g, linear_solver, num_links):
+    """The coordinates of a chain after ten steps with a linear solver of the user."""
+    system, start, args = ej.problems.chain(num_links)
+    run = ej.simulate(
+        system,
+        ej.EnergyPreserving(),
+        start,
+        args | {"g": g},
+        h=2e-3,
+        num_steps=10,
+        root_finder=ej.Newton(linear_solver=linear_solver),
+    )
+    return run.ys.q[-1]
 
 
 @functools.cache

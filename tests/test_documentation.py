@@ -1,30 +1,23 @@
 """The code in the documentation runs, and its tables of the package are complete."""
 
 import pathlib
-import re
 
 import matplotlib.pyplot as plt
 import pytest
 
 import enerjax as ej
 
-from .helpers import long
+from .helpers import code_blocks, long
 
 
 HOME = pathlib.Path(__file__).parents[1]
 PAGES = [HOME / "README.md", *sorted((HOME / "docs").glob("*.md"))]
+
+
 # Blocks that are marked with `no-run` need an optional extra, or compile for most of a
 # minute what other tests run already.
-BLOCK = re.compile(r"^```python([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-
-
-def blocks(page):
-    """The Python code of a page as pairs of a mark and a source, in order."""
-    return [(mark.strip(), code) for mark, code in BLOCK.findall(page.read_text())]
-
-
 def with_code():
-    pages = [page for page in PAGES if any(not mark for mark, _ in blocks(page))]
+    pages = [page for page in PAGES if any(not mark for mark, _ in code_blocks(page))]
     # The scheme of this page is a file of the tests, which others run.
     return long(pages, *(x for x in pages if x.name == "write-your-own-scheme.md"))
 
@@ -36,19 +29,19 @@ def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
     # This process has started its CPU back end, which reads its settings only once.
     monkeypatch.setattr(ej, "enable_fast_loops", lambda: None)
     names = {}
-    for mark, code in blocks(page):
+    for mark, code in code_blocks(page):
         if not mark:
             exec(compile(code, str(page), "exec"), names)
     plt.close("all")
 
 
 def test_every_mark_is_known():
-    assert {mark for page in PAGES for mark, _ in blocks(page)} <= {"", "no-run"}
+    assert {mark for page in PAGES for mark, _ in code_blocks(page)} <= {"", "no-run"}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_code_that_is_not_run_is_valid(page):
-    for mark, code in blocks(page):
+    for mark, code in code_blocks(page):
         if mark:
             compile(code, str(page), "exec")
 

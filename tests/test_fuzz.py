@@ -46,9 +46,9 @@ def test_random_systems_keep_their_laws_and_converge(scheme, n, free):
     ("scheme", "family"),
     [
         ("preserving", "body"),
-        pytest.param("decaying", "top", marks=pytest.mark.slow),
-        pytest.param("decaying", "halved", marks=pytest.mark.slow),
-        pytest.param("consistent", "net", marks=pytest.mark.slow),
+        ("decaying", "top"),
+        ("decaying", "halved"),
+        ("consistent", "net"),
     ],
 )
 def test_derivatives_agree_and_lanes_are_independent(scheme, family):

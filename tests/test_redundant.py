@@ -158,9 +158,7 @@ def test_derivatives_of_a_rod_that_is_declared_twice():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "scheme", ["preserving index3", pytest.param("decaying", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("scheme", ["preserving index3", "decaying"])
 def test_derivatives_of_multipliers_of_least_norm(scheme):
     """Of rows whose parts in the force turn with the length: which part of it each takes is
     for the norm to say, and changes too."""

@@ -35,9 +35,9 @@ OMEGA = np.logspace(-3, 4, 8)
     "scheme",
     [
         ej.EnergyPreserving(),
-        pytest.param(ej.EnergyDecaying(0.5), marks=pytest.mark.slow),
-        pytest.param(ej.EnergyDecaying(0.0), marks=pytest.mark.slow),
-        pytest.param(ej.EnergyDecaying(1.0), marks=pytest.mark.slow),
+        ej.EnergyDecaying(0.5),
+        ej.EnergyDecaying(0.0),
+        ej.EnergyDecaying(1.0),
     ],
 )
 def test_a_torsion_damper_never_creates_energy_in_steps_of_any_length(scheme):

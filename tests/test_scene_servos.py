@@ -67,10 +67,7 @@ def test_a_servo_moves_an_arm_as_in_its_minimal_coordinate():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "body",
-    [ej.bodies.RigidBody, pytest.param(ej.bodies.QuaternionBody, marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize("body", [ej.bodies.RigidBody, ej.bodies.QuaternionBody])
 def test_a_hinge_in_space_counts_its_turns(body):
     """A constant torque, and one that falls with the rate; rows are more than a turn
     apart."""

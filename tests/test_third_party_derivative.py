@@ -1,8 +1,6 @@
 """A discrete derivative outside of the package that is written with public names is like
 those of the library."""
 
-import re
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +9,7 @@ import pytest
 import enerjax as ej
 
 from .coordinate_increments import CoordinateIncrements
-from .helpers import HERE, imported
+from .helpers import code_of, HERE, imported
 
 
 def test_it_imports_public_names_alone():
@@ -20,9 +18,7 @@ def test_it_imports_public_names_alone():
 
 
 def test_the_tutorial_shows_this_file():
-    text = (HERE.parent / "docs" / "write-your-own.md").read_text()
-    blocks = re.findall(r"^```python[^\n]*\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
-    assert (HERE / "coordinate_increments.py").read_text() in blocks
+    assert (HERE / "coordinate_increments.py").read_text() in code_of("write-your-own.md")
 
 
 def test_it_is_the_difference_quotient_of_each_coordinate():

@@ -13,7 +13,7 @@ import scipy.integrate
 
 import enerjax as ej
 
-from .helpers import EPS, HERE, imported
+from .helpers import code_of, EPS, HERE, imported
 from .third_party_parts import cuboid, Drag, Gravitation, HardeningSpring, Rolling
 
 
@@ -26,9 +26,7 @@ def test_they_import_public_names_alone():
 
 
 def test_the_tutorial_shows_this_file():
-    text = (HERE.parent / "docs" / "write-your-own.md").read_text()
-    blocks = re.findall(r"^```python[^\n]*\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
-    shown = {block.strip() for block in blocks}
+    shown = {block.strip() for block in code_of("write-your-own.md")}
     for part in re.split(r"\n\n\n(?=@dataclass|def )", third_party_source())[1:]:
         assert any(part.strip() in block for block in shown), part
 

@@ -1,7 +1,5 @@
 """A scheme outside of the package that is written with public names is like all others."""
 
-import re
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +7,7 @@ import pytest
 
 import enerjax as ej
 
-from .helpers import EPS, HERE, imported, problem
+from .helpers import code_of, EPS, HERE, imported, problem
 from .midpoint_scheme import Midpoint
 
 
@@ -28,9 +26,7 @@ def test_it_imports_public_names_alone():
 
 
 def test_the_tutorial_shows_this_file():
-    text = (HERE.parent / "docs" / "write-your-own-scheme.md").read_text()
-    blocks = re.findall(r"^```python[^\n]*\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
-    assert (HERE / "midpoint_scheme.py").read_text() in blocks
+    assert (HERE / "midpoint_scheme.py").read_text() in code_of("write-your-own-scheme.md")
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,6 @@
 """A linear solver outside of the package that is written with public names is like all
 others."""
 
-import re
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +11,7 @@ import scipy.sparse.linalg
 import enerjax as ej
 
 from .block_tridiagonal import along_chain
-from .helpers import HERE, imported, long
+from .helpers import chain_end, code_of, HERE, imported, long
 
 
 NUM_LINKS = 20
@@ -39,23 +37,9 @@ class SciPy(ej.AbstractSparseSolver):
 SOLVERS = {"blocks": along_chain(NUM_LINKS, 2), "scipy": SciPy()}
 
 
-def end(g, linear_solver, num_links=NUM_LINKS):
-    system, start, args = ej.problems.chain(num_links)
-    run = ej.simulate(
-        system,
-        ej.EnergyPreserving(),
-        start,
-        args | {"g": g},
-        h=2e-3,
-        num_steps=10,
-        root_finder=ej.Newton(linear_solver=linear_solver),
-    )
-    return run.ys.q[-1]
-
-
 @jax.jit
 def pushed(g, linear_solver):
-    return jax.jvp(lambda g: end(g, linear_solver), (g,), (1.0,))
+    return jax.jvp(lambda g: chain_end(g, linear_solver, NUM_LINKS), (g,), (1.0,))
 
 
 def test_it_imports_public_names_alone():
@@ -65,9 +49,7 @@ def test_it_imports_public_names_alone():
 
 
 def test_the_tutorial_shows_this_file():
-    text = (HERE.parent / "docs" / "write-your-own.md").read_text()
-    blocks = re.findall(r"^```python[^\n]*\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
-    assert (HERE / "block_tridiagonal.py").read_text() in blocks
+    assert (HERE / "block_tridiagonal.py").read_text() in code_of("write-your-own.md")
 
 
 @pytest.fixture(scope="module")
@@ -81,14 +63,14 @@ def test_the_motion_and_its_derivatives_are_those_of_the_default(name, expected)
     q, rate = pushed(9.81, solver)
     np.testing.assert_allclose(q, expected[0], atol=1e-11)  # solver
     np.testing.assert_allclose(rate, expected[1], atol=1e-10)  # solver
-    pulled = jax.jit(jax.grad(lambda g: end(g, solver)[-1]))(9.81)
+    pulled = jax.jit(jax.grad(lambda g: chain_end(g, solver, NUM_LINKS)[-1]))(9.81)
     assert pulled == pytest.approx(float(expected[1][-1]), rel=1e-9)  # solver
 
 
 @pytest.mark.parametrize("name", long(SOLVERS, "scipy"))
 def test_lanes_of_a_batch_are_solved_apart(name):
     gs = jnp.array([5.0, 9.81])
-    lanes = jax.jit(jax.vmap(lambda g: end(g, SOLVERS[name])))(gs)
+    lanes = jax.jit(jax.vmap(lambda g: chain_end(g, SOLVERS[name], NUM_LINKS)))(gs)
     alone = [pushed(g, SOLVERS[name])[0] for g in gs]
     np.testing.assert_allclose(lanes, alone, atol=1e-12)  # solver
 
@@ -107,8 +89,8 @@ def test_few_unknowns_go_to_the_given_solver_too():
         def solve(self, pattern, factors, right):
             return jnp.linalg.solve(factors, right)
 
-    q = end(9.81, Counting(), num_links=2)
-    np.testing.assert_allclose(q, end(9.81, None, num_links=2), atol=1e-12)  # solver
+    q = chain_end(9.81, Counting(), num_links=2)
+    np.testing.assert_allclose(q, chain_end(9.81, None, num_links=2), atol=1e-12)  # solver
     assert set(sizes) == {8}
 
 
@@ -118,7 +100,7 @@ def test_a_singular_matrix_is_a_failure_of_the_run():
             return jnp.full_like(right, jnp.nan)
 
     with pytest.raises(RuntimeError, match="became singular"):
-        end(9.81, Broken(), num_links=2)
+        chain_end(9.81, Broken(), num_links=2)
 
 
 def test_the_pattern_is_that_of_a_matrix_in_csr():
@@ -152,10 +134,10 @@ def test_wrong_shapes_and_types_are_told():
             return right
 
     with pytest.raises(ValueError, match=r"`Short.solve` must .*\[8\].*got .*\[7\]"):
-        end(9.81, Short(), num_links=2)
+        chain_end(9.81, Short(), num_links=2)
     with pytest.raises(ValueError, match="`NoArray.solve` must .* got NoneType"):
-        end(9.81, NoArray(), num_links=2)
+        chain_end(9.81, NoArray(), num_links=2)
     with pytest.raises(TypeError, match="`NoTree.factorise` must .* a str"):
-        end(9.81, NoTree(), num_links=2)
+        chain_end(9.81, NoTree(), num_links=2)
     with pytest.raises(TypeError, match="AbstractSparseSolver"):
         ej.Newton(linear_solver=np.linalg.solve)  # pyright: ignore

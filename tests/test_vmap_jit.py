@@ -52,7 +52,7 @@ AXES = {"alpha": (0,), "h": (1,), "args": (2,), "start": (3, 4), "all": (0, 1, 2
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("swept", long(AXES, "alpha", "start"))
+@pytest.mark.parametrize("swept", AXES)
 def test_vmap_equals_a_loop(swept):
     numbers = lanes()
     in_axes = tuple(0 if i in AXES[swept] else None for i in range(5))
