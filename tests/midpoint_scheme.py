@@ -74,7 +74,8 @@ class Midpoint(AbstractOneSolveScheme[Increment, StepProblem]):
         start, middle = problem.start, problem.start.q + 0.5 * problem.h * z.rate
 
         def velocity(reaction: Reaction) -> tuple[Array]:
-            correction = reaction(middle, problem.middle_time, z.velocity_impulse)
+            at = middle, problem.middle_time
+            correction = reaction(at, at, z.velocity_impulse)
             return (2 * (problem.velocity(z) - correction) - start.v,)
 
         (end,) = problem.nodes(velocity, (z, problem.end_time))

@@ -71,9 +71,10 @@ def test_a_joint_leaves_its_degrees_of_freedom_and_carries_all_other_loads(name)
     scene, motions = on_ground(name), JOINTS[name][1]
     system, q, args = scene.system, scene.q, scene.args
     assert system.constraint is not None
-    jacobian = np.asarray(jax.jacfwd(system.constraint)(q, args))
-    # Six constraints of the directors, and those of the joint.
-    assert np.linalg.matrix_rank(jacobian) == len(jacobian) == 6 + 6 - len(motions)
+    of_joint = jax.jacfwd(system.constraint)(q, args)
+    jacobian = np.concatenate([of_joint, jax.jacfwd(system.internal)(q)])
+    # Those of the joint, and six constraints of the directors.
+    assert np.linalg.matrix_rank(jacobian) == len(jacobian) == 6 - len(motions) + 6
     for velocity, spin in motions:
         # Of the mass centre, where the joint's point, the origin, moves so.
         velocity = velocity + np.cross(spin, q[:3])

@@ -36,8 +36,8 @@ def test_the_steady_top_precesses_as_its_closed_form():
     solution = run("steady_top", 2e-3, 250, 50)
     for t, q in zip(solution.ts, solution.ys.q, strict=True):
         rotation = about(2, 10 * t) @ about(0, np.pi / 3) @ about(2, 135.6 * t)
-        # Truncation, measured: 1.3e-7 of 0.075, while the top spins eleven times.
-        np.testing.assert_allclose(q[:3], 0.075 * rotation[:, 2], rtol=0, atol=2e-7)
+        # Truncation, measured: 2.8e-7 of 0.075, while the top spins eleven times.
+        np.testing.assert_allclose(q[:3], 0.075 * rotation[:, 2], rtol=0, atol=4e-7)
         np.testing.assert_allclose(q[3:], rotation.T.ravel(), rtol=0, atol=5e-4)
     assert leak(solution) <= 1e-12
     assert np.max(np.abs(solution.audit.constraint)) <= 1e-13

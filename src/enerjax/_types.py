@@ -6,14 +6,16 @@ from typing_extensions import TypeAliasType
 
 
 # Dimensions used in every annotation of the package:
-# nq coordinates, nv velocities, nc constraints (joints first, then those of the
-# coordinates), nj joint constraints. `...` stands for the time axis of a `Solution`.
+# nq coordinates, nv velocities, nu increments (the unknowns of the motion in a step), nc
+# constraints (joints first, then those of the coordinates), nj joint constraints. `...`
+# stands for the time axis of a `Solution`.
 Args = TypeAliasType("Args", Any)
 Scalar: TypeAlias = Float[Array, ""]
 Flag: TypeAlias = Bool[Array, ""]
 Count: TypeAlias = Int[Array, ""]
 Coordinates: TypeAlias = Float[Array, " nq"]
 Velocities: TypeAlias = Float[Array, " nv"]
+Increments: TypeAlias = Float[Array, " nu"]
 Multipliers: TypeAlias = Float[Array, " nc"]
 JointMultipliers: TypeAlias = Float[Array, " nj"]
 Times: TypeAlias = Float[Array, " times"]

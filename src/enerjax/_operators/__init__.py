@@ -13,9 +13,14 @@ from .scaling import (
 from .separable import SeparableModel as SeparableModel
 
 
-def make_model(system: AbstractSystem, state: State, args: Args) -> AbstractModel:
-    """The model of a system. The scales are those at `state`, which is a user's state."""
+def make_model(
+    system: AbstractSystem, state: State, args: Args, *, rotates: bool = False
+) -> AbstractModel:
+    """The model of a system. The scales are those at `state`, which is a user's state.
+
+    With `rotates`, rigid bodies are moved by rotations; see `SeparableModel`.
+    """
     if isinstance(system, AbstractCanonicalSystem):
         return CanonicalModel(system, state, args)
     assert isinstance(system, System)
-    return SeparableModel(system, state, args)
+    return SeparableModel(system, state, args, rotates=rotates)

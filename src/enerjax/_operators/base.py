@@ -33,13 +33,24 @@ from jaxtyping import Array, Float, PyTree
 from .._discrete import AbstractCorrected, AbstractDerivative
 from .._solvers import Assembled, RowPattern, Symmetric
 from .._system import AbstractSystem, State
-from .._types import Args, Coordinates, JointMultipliers, Multipliers, Scalar, Velocities
+from .._types import (
+    Args,
+    Coordinates,
+    Increments,
+    JointMultipliers,
+    Multipliers,
+    Scalar,
+    Velocities,
+)
 from .constraint_matrix import ConstraintMatrix
 from .interval import Gradient, Increment, Scales, Time, time_rate
 
 
-# The function for `M^-1 C(q, t)^T eta`, the velocity that velocity-level multipliers add.
-Reaction: TypeAlias = Callable[[Coordinates, Time, JointMultipliers], Velocities]
+# The function `reaction(a, b, eta)`, where `a` and `b` are positions `(q, t)`, for the mean
+# of `M^-1 C(q, t)^T eta` over the interval between them: the velocity that velocity-level
+# multipliers add.
+Position: TypeAlias = tuple[Coordinates, Time]
+Reaction: TypeAlias = Callable[[Position, Position, JointMultipliers], Velocities]
 
 
 class AbstractModel(eqx.Module):
@@ -76,6 +87,22 @@ class AbstractModel(eqx.Module):
     def to_user(self, state: State) -> State:
         """The user's state `(q, v)` that corresponds to a state of the model; no time."""
 
+    @property
+    @abc.abstractmethod
+    def in_rates(self) -> "AbstractModel":
+        """The model without rotations, whose velocities are the rates of coordinates.
+
+        It is the model itself, except for rigid bodies that are moved by rotations.
+        """
+
+    @abc.abstractmethod
+    def to_rates(self, state: State) -> State:
+        """The state of `in_rates` that corresponds to a state of this model."""
+
+    @abc.abstractmethod
+    def user_multipliers(self, multipliers: Multipliers) -> Multipliers:
+        """The multipliers of the user's rows, which are those of `in_rates`."""
+
     @abc.abstractmethod
     def kinetic(self, state: State) -> Scalar:
         """The kinetic energy."""
@@ -100,26 +127,33 @@ class AbstractModel(eqx.Module):
         b: State,
         h: Scalar,
         increment: Increment,
+        *,
+        is_step: bool,
     ) -> Gradient:
-        """The discrete gradient over `a -> b` with the multipliers of `increment`."""
+        """The discrete gradient over `a -> b` with the multipliers of `increment`.
+
+        With `is_step`, the rate of this increment leads from `a` to `b`.
+        """
 
     @abc.abstractmethod
     def structure(
-        self, a: State, b: State, h: Scalar, rate: Coordinates, gradient: Gradient
-    ) -> tuple[Coordinates, Float[Array, " np"]]:
-        """`S_q` and `S_mu/h`; `rate` is `(q_b - q_a)/h` without cancellation errors."""
+        self, a: State, b: State, h: Scalar, rate: Increments, gradient: Gradient
+    ) -> tuple[Increments, Float[Array, " np"]]:
+        """`S_q` and `S_mu/h`; `rate` is that of the increment from `a` to `b`."""
 
     @abc.abstractmethod
     def node_momenta(
         self,
         unknowns: tuple[Float[Array, " np"], ...],
         velocities: Callable[[Reaction], tuple[Velocities, ...]],
+        step: Increments | None,
     ) -> tuple[Velocities, ...]:
         """The field `v` of the states at the nodes of a step.
 
         With constant inertia these are the velocities. `velocities` computes them from the
-        rows `S_mu`, and its argument is the function for `M^-1 C^T eta`. With a Hamiltonian
-        these are the momenta, which are the `unknowns`.
+        rows `S_mu`, and its argument is the function for the mean of `M^-1 C^T eta`. With a
+        Hamiltonian these are the momenta, which are the `unknowns`. If the step is a single
+        interval, `step` is its displacement.
         """
 
     @abc.abstractmethod
@@ -127,8 +161,8 @@ class AbstractModel(eqx.Module):
         """`rates` itself where momenta are unknowns, else an array of shape `(0,)`."""
 
     @abc.abstractmethod
-    def slope(self, state: State) -> Coordinates:
-        """`dH/dq` less the applied forces `L^T f`."""
+    def slope(self, state: State) -> Increments:
+        """The rows of `dH/dq` less the applied forces `L^T f`."""
 
     @abc.abstractmethod
     def velocity(self, state: State) -> Velocities:
@@ -149,12 +183,20 @@ class AbstractModel(eqx.Module):
         """`(mu_b - mu_a) . (dH/dmu(b) - dH/dmu(a)) / 2`"""
 
     @abc.abstractmethod
-    def push(self, qa: Coordinates, qb: Coordinates, rate: Coordinates) -> Velocities:
+    def push(self, qa: Coordinates, qb: Coordinates, rate: Increments) -> Velocities:
         """`Lm rate`"""
 
     @abc.abstractmethod
-    def pull(self, qa: Coordinates, qb: Coordinates, force: Velocities) -> Coordinates:
+    def pull(self, qa: Coordinates, qb: Coordinates, force: Velocities) -> Increments:
         """`Lm^T force`"""
+
+    @abc.abstractmethod
+    def displacement(self, q: Coordinates, step: Increments) -> Coordinates:
+        """The change of the coordinates in a step from `q`."""
+
+    @abc.abstractmethod
+    def rates(self, q: Coordinates, v: Velocities) -> Increments:
+        """The rates of an increment, in the limit of short steps, of a motion with `v`."""
 
     @abc.abstractmethod
     def reaction_row(self, state: State, eta: JointMultipliers) -> Float[Array, " np"]:
@@ -233,8 +275,16 @@ class AbstractModel(eqx.Module):
         _, transpose = jax.vjp(lambda q: self.constraint(q, t), q)
         return transpose(multipliers)[0]
 
+    @abc.abstractmethod
     def fixed(self, q: Coordinates) -> Float[Array, " nf"]:
         """The scleronomic joints, which do not depend on time."""
+
+    @abc.abstractmethod
+    def force(self, q: Coordinates, v: Velocities, t: Time) -> Velocities:
+        """`f(q, v, t)` of a system that has forces."""
+
+    def user_constraint(self, q: Coordinates) -> Float[Array, " nf"]:
+        """The constraint of the user; it does not depend on time."""
         if self.system.constraint is None:
             return jnp.zeros((0,), q.dtype)
         return self.system.constraint(q, self.args)
@@ -289,8 +339,8 @@ class AbstractModel(eqx.Module):
             out = out + h * driven.velocity_impulse @ psi
         return out
 
-    def force(self, q: Coordinates, v: Velocities, t: Time) -> Velocities:
-        """`f(q, v, t)` of a system that has forces."""
+    def user_force(self, q: Coordinates, v: Velocities, t: Time) -> Velocities:
+        """`f(q, v, t)` at the velocities of the user."""
         assert self.system.force is not None
         assert t is not None
         return self.system.force(q, v, t, self.args)
@@ -321,7 +371,7 @@ class AbstractModel(eqx.Module):
         energies that bodies at rest would gain in the time `h` from the forces and from the
         driven constraints. It is one if all three are zero.
         """
-        gained = h * self.slope(state) / self.scales.coordinate
+        gained = h * self.slope(state) / self.scales.step
         size = jnp.maximum(2 * self.kinetic(state), gained @ gained)
         if self.system.driven is not None:
             q, t = state.q, state.t
@@ -330,8 +380,8 @@ class AbstractModel(eqx.Module):
             size = jnp.maximum(size, jnp.sum((moved / self.scales.constraint) ** 2))
         return jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
 
-    def force_size(self, state: State) -> Coordinates:
-        """The size of the terms of `dH/dq` and of the applied forces, per coordinate.
+    def force_size(self, state: State) -> Increments:
+        """The size of the terms of `dH/dq` and of the applied forces, row by row.
 
         In an equilibrium the sum of the forces is zero, but the forces of the springs and
         the weights are not. The computed sum is then round-off: the machine epsilon times
@@ -365,17 +415,25 @@ class AbstractModel(eqx.Module):
         multipliers minimise.
         """
         q = state.q
-        coordinate = jnp.sqrt(self.metric(state).diagonal())
-        constraint = lambda q: self.constraint(q, state.t)
-        pattern = RowPattern(constraint, q)
-        entries, columns = pattern.derivative(constraint, q), pattern.columns
-        constraint = jnp.sqrt(jnp.sum((entries / coordinate[columns]) ** 2, axis=1))
+        step = jnp.sqrt(self.metric(state).diagonal())
+        coordinate = self.coordinate_scale(step)
+        rows = lambda q: self.constraint(q, state.t)
+        pattern = RowPattern(rows, q)
+        entries, columns = pattern.derivative(rows, q), pattern.columns
+        # A bound on the size of the terms. The terms themselves may be zero at the start,
+        # as those of the product of two perpendicular axes.
+        length = lambda rows: jnp.sqrt(jnp.sum(rows**2, axis=1))
+        constraint = length(entries / coordinate[columns])
+        size = constraint * length(pattern.own(coordinate * q))
         # A zero gradient makes the step equations singular, which is reported as a failure.
         # The scaling must not divide by zero before that.
         constraint = jnp.where(constraint > 0, constraint, 1.0)
-        size = jnp.sum(jnp.abs(entries * q[columns]), axis=1)
-        scales = Scales(coordinate, constraint, size)
+        scales = Scales(coordinate, step, constraint, size)
         return scales if self.system.redundant else jax.lax.stop_gradient(scales)
+
+    @abc.abstractmethod
+    def coordinate_scale(self, step: Increments) -> Coordinates:
+        """The scales of the coordinates, given those of the rates of an increment."""
 
 
 # The evaluation of a term takes a few operations, each with a rounding error.

@@ -91,11 +91,37 @@ class CanonicalModel(AbstractModel):
         self,
         unknowns: tuple[Float[Array, " np"], ...],
         velocities: Callable[[Reaction], tuple[Velocities, ...]],
+        step: Coordinates | None,
     ) -> tuple[Velocities, ...]:
         return unknowns
 
     def momentum_rows(self, rates: Velocities) -> Float[Array, " np"]:
         return rates
+
+    @property
+    def in_rates(self) -> "CanonicalModel":
+        return self
+
+    def to_rates(self, state: State) -> State:
+        return state
+
+    def user_multipliers(self, multipliers: Multipliers) -> Multipliers:
+        return multipliers
+
+    def fixed(self, q: Coordinates) -> Float[Array, " nf"]:
+        return self.user_constraint(q)
+
+    def force(self, q: Coordinates, v: Velocities, t: Time) -> Velocities:
+        return self.user_force(q, v, t)
+
+    def displacement(self, q: Coordinates, step: Coordinates) -> Coordinates:
+        return step
+
+    def rates(self, q: Coordinates, v: Velocities) -> Coordinates:
+        return self.lift(q, v)
+
+    def coordinate_scale(self, step: Coordinates) -> Coordinates:
+        return step
 
     def push(self, qa: Coordinates, qb: Coordinates, rate: Coordinates) -> Velocities:
         return rate
@@ -110,6 +136,8 @@ class CanonicalModel(AbstractModel):
         b: State,
         h: Scalar,
         increment: Increment,
+        *,
+        is_step: bool,
     ) -> Gradient:
         size = a.q.size
         fixed, driven = self.split(increment)
@@ -148,7 +176,10 @@ class CanonicalModel(AbstractModel):
     def structure(
         self, a: State, b: State, h: Scalar, rate: Coordinates, gradient: Gradient
     ) -> tuple[Coordinates, Float[Array, " np"]]:
-        return b.v - a.v + gradient.impulse, rate - gradient.rate
+        balance = b.v - a.v + gradient.impulse
+        if gradient.rows is not None:
+            balance = balance + gradient.rows
+        return balance, rate - gradient.rate
 
     def reaction_row(self, state: State, eta: JointMultipliers) -> Float[Array, " np"]:
         _, transpose = jax.vjp(lambda p: self.joint_rate(state.q, p, state.t), state.v)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._discrete import AbstractDerivative
-from .._types import Coordinates, JointMultipliers, Multipliers, Scalar
+from .._types import Coordinates, Increments, JointMultipliers, Multipliers, Scalar
 
 
 # The time of a state, or `None` for a system without forces and driven constraints.
@@ -27,9 +27,12 @@ class Increment(eqx.Module):
     | field | shape | as unknown | as row |
     |---|---|---|---|
     | `impulse` | `(nc,)` | `h lambda` | `Phi(q)/h` |
-    | `rate` | `(nq,)` | `(q - q0)/h` | balance of momentum, `S_q` |
+    | `rate` | `(nu,)` | the step over `h` | balance of momentum, `S_q` |
     | `momentum` | `(np,)` | `p`; empty where velocities are eliminated | `S_mu/h` |
     | `velocity_impulse` | `(nj,)` | `eta` | `psi(q, v)`; empty for index 3 |
+
+    A step is `q - q0`, or for rigid bodies that are moved by rotations a translation and a
+    rotation vector, six numbers for each body.
 
     `impulse` is an energy times a time per unit of the constraint, and its row a rate of
     change of the constraint; `rate` is a coordinate per time, and its row a generalised
@@ -40,7 +43,7 @@ class Increment(eqx.Module):
     """
 
     impulse: Multipliers
-    rate: Coordinates
+    rate: Increments
     momentum: Float[Array, " np"]
     velocity_impulse: JointMultipliers
 
@@ -53,24 +56,30 @@ class Gradient(eqx.Module):
       are eliminated.
     - `work`: `h dH/dt`, the work of the driven constraints (energy). `None` if there are
       none, and over a jump, in which no time passes.
+    - `rows`: terms that belong to the rows of the balance of momentum, shape `(nu,)`, and
+      not to coordinates: forces, and torques on rates. `None` if there are none.
     """
 
     impulse: Coordinates
     rate: Float[Array, " np"]
     work: Scalar | None = None
+    rows: Increments | None = None
 
-    def less(self, load: Coordinates | None) -> "Gradient":
+    def less(self, load: Increments | None) -> "Gradient":
         """This gradient minus the impulse `h Lm^T f` of a force."""
         if load is None:
             return self
-        return Gradient(self.impulse - load, self.rate, self.work)
+        rows = -load if self.rows is None else self.rows - load
+        return Gradient(self.impulse, self.rate, self.work, rows)
 
 
 class Scales(eqx.Module):
     """Factors that give rates and impulses the dimension of the square root of an energy.
 
-    - `coordinate`: the square root of the inertia of each coordinate. `rate * coordinate`
-      is the square root of an energy.
+    - `coordinate`: the square root of the inertia of each coordinate. The rate of a
+      coordinate times it is the square root of an energy.
+    - `step`: the same for each rate of an `Increment`; that is `coordinate` itself, except
+      for rigid bodies that are moved by rotations.
     - `constraint`: the norm of the gradient of each constraint in the metric of the inverse
       inertia. `constraint rate / constraint` and `impulse * constraint` are the square root
       of an energy.
@@ -79,6 +88,7 @@ class Scales(eqx.Module):
     """
 
     coordinate: Float[Array, " nq"]
+    step: Float[Array, " nu"]
     constraint: Float[Array, " nc"]
     constraint_size: Float[Array, " nc"]
 

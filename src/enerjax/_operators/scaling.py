@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from .._system import State
-from .._types import Coordinates, Scalar
+from .._types import Increments, Scalar
 from .base import AbstractModel
 from .interval import Increment
 
@@ -32,10 +32,11 @@ def scales_like(
     # At rest the computed unknowns are round-off of the forces and of the coordinates.
     # Newton's corrections are measured relative to the unknowns, so they need this floor.
     rounding = jnp.maximum(
-        forces / scales.coordinate, scales.coordinate * jnp.abs(start.q / h)
+        jnp.linalg.norm(forces / scales.step),
+        jnp.linalg.norm(scales.coordinate * start.q / h),
     )
     small = jnp.finfo(h.dtype).eps ** 0.5
-    least = small * jax.lax.stop_gradient(jnp.linalg.norm(rounding))
+    least = small * jax.lax.stop_gradient(rounding)
     unit = jnp.maximum(root, least)
     is_increment = lambda x: isinstance(x, Increment)
 
@@ -43,8 +44,8 @@ def scales_like(
         if not is_increment(x):
             return jnp.ones_like(x)
         joint = scales.constraint[: x.velocity_impulse.size]
-        rate = unit / scales.coordinate
-        momentum = (unit * scales.coordinate)[: x.momentum.size]
+        rate = unit / scales.step
+        momentum = (unit * scales.step)[: x.momentum.size]
         impulse = (unit / scales.constraint)[: x.impulse.size]
         return Increment(impulse, rate, momentum, unit / joint)
 
@@ -56,8 +57,8 @@ def scales_like(
         # in a step. Its row cannot be more accurate than the round-off of these terms.
         position = root * scales.constraint + scales.constraint_size / jnp.abs(h)
         # Likewise, the balance of momentum is limited by the round-off of the forces.
-        momentum = jnp.maximum(root * scales.coordinate, _ROUND_OFF_PART * forces)
-        rate = (root / scales.coordinate)[: x.momentum.size]
+        momentum = jnp.maximum(root * scales.step, _ROUND_OFF_PART * forces)
+        rate = (root / scales.step)[: x.momentum.size]
         return Increment(position[: x.impulse.size], momentum, rate, root * joint)
 
     unknowns, rows = (jax.tree.map(f, z, is_leaf=is_increment) for f in (unknown, row))
@@ -65,12 +66,13 @@ def scales_like(
 
 
 def roughness(
-    coordinate: Coordinates, added: PyTree[Any], before: PyTree[Any], unit: PyTree[Any]
+    inertia: Increments, added: PyTree[Any], before: PyTree[Any], unit: PyTree[Any]
 ) -> Float[Array, " 3"]:
     """The norms of the second and third differences of the velocities of the last steps.
 
     They are computed from `added` and `before`: the differences between the unknowns and
-    their values without forces, for this step and for the three steps before. Returns the
+    their values without forces, for this step and for the three steps before. `inertia` is
+    the scale `step` of `Scales`. Returns the
     norm of the second difference and that of the third (square root of an energy), and the
     norm of the second difference in the scales `unit` of the unknowns. They have zero
     derivatives.
@@ -80,7 +82,7 @@ def roughness(
     ends = lambda z: list(filter(is_increment, leaves(z)))[-1].rate
     rates = jnp.concatenate([ends(added)[None], ends(before)])
     new, old = jnp.diff(rates, n=2, axis=0)
-    size = lambda x: jnp.linalg.norm(x * coordinate)
+    size = lambda x: jnp.linalg.norm(x * inertia)
     # The larger of two successive differences, because one of them can pass through zero.
     second = jnp.maximum(size(new), size(old))
     part = jnp.linalg.norm(new / ends(unit))

@@ -11,6 +11,7 @@ of the velocities at the ends of an interval enters `S_mu`, so the schemes solve
 for the velocities in closed form.
 """
 
+import functools
 from collections.abc import Callable
 
 import equinox as eqx
@@ -32,9 +33,23 @@ from .._solvers import (
     solve,
     Symmetric,
 )
-from .._system import AbstractKinematics, IdentityKinematics, State, System
-from .._types import Args, Coordinates, JointMultipliers, Multipliers, Scalar, Velocities
-from .base import AbstractModel, Reaction
+from .._system import (
+    AbstractKinematics,
+    IdentityKinematics,
+    RigidKinematics,
+    State,
+    System,
+)
+from .._types import (
+    Args,
+    Coordinates,
+    Increments,
+    JointMultipliers,
+    Multipliers,
+    Scalar,
+    Velocities,
+)
+from .base import AbstractModel, Position, Reaction
 from .constraint_matrix import ConstraintMatrix
 from .elements import (
     element_energies,
@@ -46,7 +61,12 @@ from .interval import Gradient, gradient_and_work, Increment, Scales, Time, time
 
 
 class SeparableModel(AbstractModel):
-    """A `System` for fixed `args`; the `v` of its states are the velocities."""
+    """A `System` for fixed `args`; the `v` of its states are the velocities.
+
+    With `rotates`, its rigid bodies are moved by rotations: the velocities of a body are
+    `(xdot, W)`, and its directors need no constraints. Otherwise the velocities are those
+    of the user, and the constraints between the directors follow those of the user.
+    """
 
     system: System
     args: Args
@@ -58,13 +78,29 @@ class SeparableModel(AbstractModel):
     kinematics: AbstractKinematics
     # The index tables of `constraint_matrix`; `None` where there is none.
     constraint_tables: SchurTables | None = eqx.field(static=True)
+    # For bodies that are moved by rotations, the model with their directors as coordinates.
+    without_rotations: "SeparableModel | None"
 
-    def __init__(self, system: System, state: State, args: Args):
+    def __init__(
+        self,
+        system: System,
+        state: State,
+        args: Args,
+        *,
+        rotates: bool = False,
+    ):
         self.system = system
         self.args = args
         self.has_linear_potential = has_linear_potential(system, state.q, args)
-        self.kinematics = system.kinematics.with_blocks(state.q, self.coordinate, args)
-        self.inertia = system.inertia(state, args)
+        bodies = system.bodies(state.q) if rotates else None
+        if bodies is None:
+            self.kinematics = system.kinematics.with_blocks(state.q, self.coordinate, args)
+            self.inertia = system.inertia(state, args)
+        else:
+            self.kinematics = RigidKinematics(bodies)
+            self.inertia = system.inertia_of_rotations(bodies, args, state.q.dtype)
+        rotates = bodies is not None
+        self.without_rotations = SeparableModel(system, state, args) if rotates else None
         self.inverse_inertia = inverse_of(self.inertia)
         self.scales = self._scales(state)
         self.constraint_tables = self._constraint_tables(state)
@@ -78,10 +114,31 @@ class SeparableModel(AbstractModel):
         return isinstance(self.kinematics, IdentityKinematics)
 
     def to_internal(self, state: State) -> State:
+        if isinstance(self.kinematics, RigidKinematics):
+            return State(state.q, self.kinematics.velocity(state.q, state.v), state.t)
         return state
 
     def to_user(self, state: State) -> State:
-        return State(state.q, state.v)
+        return State(state.q, self._user_velocity(state.q, state.v))
+
+    @property
+    def in_rates(self) -> "SeparableModel":
+        return self if self.without_rotations is None else self.without_rotations
+
+    def to_rates(self, state: State) -> State:
+        return State(state.q, self._user_velocity(state.q, state.v), state.t)
+
+    def user_multipliers(self, multipliers: Multipliers) -> Multipliers:
+        """With zeros for the constraints between directors, which rotations satisfy."""
+        if not isinstance(self.kinematics, RigidKinematics):
+            return multipliers
+        q = self.kinematics.bodies.at_rest(multipliers.dtype)
+        count = jax.eval_shape(self.fixed, q).size
+        none = jnp.zeros((self.system.internal(q).size,), multipliers.dtype)
+        return jnp.concatenate([multipliers[:count], none, multipliers[count:]])
+
+    def _user_velocity(self, q: Coordinates, v: Velocities) -> Velocities:
+        return self.lift(q, v) if isinstance(self.kinematics, RigidKinematics) else v
 
     def kinetic(self, state: State) -> Scalar:
         return 0.5 * state.v @ self.inertia @ state.v
@@ -111,14 +168,24 @@ class SeparableModel(AbstractModel):
             return jnp.zeros((0,), q.dtype)
         return self.system.coordinate_constraint(q, self.args)
 
+    def fixed(self, q: Coordinates) -> Float[Array, " nf"]:
+        joints = self.user_constraint(q)
+        if self.system.rigid_bodies is None or isinstance(self.kinematics, RigidKinematics):
+            return joints
+        return jnp.concatenate([joints, self.system.internal(q)])
+
     def constraint(self, q: Coordinates, t: Time) -> Multipliers:
         return jnp.concatenate([self.joint(q, t), self.coordinate(q)])
 
-    def slope(self, state: State) -> Coordinates:
-        slope = jax.grad(self._potential)(state.q)
+    def force(self, q: Coordinates, v: Velocities, t: Time) -> Velocities:
+        return self.user_force(q, self._user_velocity(q, v), t)
+
+    def slope(self, state: State) -> Increments:
+        q = state.q
+        slope = self.kinematics.pull_back(q, q, jax.grad(self._potential)(q))
         if self.system.force is None:
             return slope
-        return slope - self._pull(state.q, self.force(state.q, state.v, state.t))
+        return slope - self.pull(q, q, self.force(q, state.v, state.t))
 
     def velocity(self, state: State) -> Velocities:
         return state.v
@@ -132,20 +199,29 @@ class SeparableModel(AbstractModel):
         self,
         unknowns: tuple[Float[Array, " np"], ...],
         velocities: Callable[[Reaction], tuple[Velocities, ...]],
+        step: Increments | None,
     ) -> tuple[Velocities, ...]:
-        return velocities(self.reaction_at)
+        if step is None or not isinstance(self.kinematics, RigidKinematics):
+            return velocities(self._mean_reaction)
+        return velocities(functools.partial(self._reaction_of_step, step))
 
     def momentum_rows(self, rates: Velocities) -> Float[Array, " np"]:
         return rates[:0]
 
-    def push(self, qa: Coordinates, qb: Coordinates, rate: Coordinates) -> Velocities:
-        return self.kinematics.push(0.5 * (qa + qb), rate, self.args)
+    def displacement(self, q: Coordinates, step: Increments) -> Coordinates:
+        return self.kinematics.displacement(q, step)
 
-    def pull(self, qa: Coordinates, qb: Coordinates, force: Velocities) -> Coordinates:
-        return self._pull(0.5 * (qa + qb), force)
+    def rates(self, q: Coordinates, v: Velocities) -> Increments:
+        return self.kinematics.rates(q, v, jax.jacfwd(self.coordinate), self.args)
 
-    def _pull(self, q: Coordinates, momentum: Velocities) -> Coordinates:
-        return self.kinematics.pull(q, momentum, self.args)
+    def push(self, qa: Coordinates, qb: Coordinates, rate: Increments) -> Velocities:
+        return self.kinematics.push(qa, qb, rate, self.args)
+
+    def pull(self, qa: Coordinates, qb: Coordinates, force: Velocities) -> Increments:
+        return self.kinematics.pull(qa, qb, force, self.args)
+
+    def _momentum_rows(self, q: Coordinates, momentum: Velocities) -> Increments:
+        return self.kinematics.momentum_rows(q, momentum, self.args)
 
     def lift(self, q: Coordinates, v: Velocities) -> Coordinates:
         relations = jax.jacfwd(self.coordinate)
@@ -158,12 +234,21 @@ class SeparableModel(AbstractModel):
         b: State,
         h: Scalar,
         increment: Increment,
+        *,
+        is_step: bool,
     ) -> Gradient:
-        mean_velocity = 0.5 * (a.v + b.v)
         fixed, driven = self.split(increment)
+        eta, torque = increment.velocity_impulse, None
+        mean_velocity = 0.5 * (a.v + b.v)
+        mean_rate = lambda q: self.lift(q, mean_velocity)
+        if is_step and isinstance(self.kinematics, RigidKinematics) and eta.size > 0:
+            constant = 0.5 * (self.lift(a.q, a.v) + self.lift(b.q, b.v))
+            mean_rate = lambda q: constant
+            by_rate = self._mean_joint_force((a.q, a.t), (b.q, b.t), eta)
+            torque = h * self.kinematics.spin_rows(a.q, constant, by_rate)
 
         constraint = lambda q: jnp.concatenate([self.fixed(q), self.coordinate(q)])
-        rate = lambda q: jax.jvp(self.fixed, (q,), (self.lift(q, mean_velocity),))[1]
+        rate = lambda q: jax.jvp(self.fixed, (q,), (mean_rate(q),))[1]
 
         def action(q: Coordinates) -> Scalar:
             out = h * self._potential(q)
@@ -174,7 +259,7 @@ class SeparableModel(AbstractModel):
             return out
 
         def driven_action(q: Coordinates, t: Time) -> Scalar:
-            return self.driven_action(q, self.lift(q, mean_velocity), t, h, driven)
+            return self.driven_action(q, mean_rate(q), t, h, driven)
 
         with_time = None if self.system.driven is None else driven_action
         ends, none = ((a.q, a.t), (b.q, b.t)), jnp.zeros((0,), h.dtype)
@@ -184,7 +269,7 @@ class SeparableModel(AbstractModel):
             impulse, work = gradient_and_work(
                 derivative, action, with_time, *ends, size=size
             )
-            return Gradient(impulse, none, work)
+            return Gradient(impulse, none, work, torque)
         rows: list[Summands] = [lambda q, fn=fn: h * fn(q) for fn in energies]
         rows += [lambda q: fixed.impulse * constraint(q)]
         if fixed.velocity_impulse.size > 0:
@@ -192,21 +277,52 @@ class SeparableModel(AbstractModel):
         impulse, work = gradient_and_work_by_rows(derivative, rows, with_time, *ends)
         if self.has_linear_potential:
             impulse = impulse + h * jax.grad(self._potential)(a.q)
-        return Gradient(impulse, none, work)
+        return Gradient(impulse, none, work, torque)
 
     def structure(
-        self, a: State, b: State, h: Scalar, rate: Coordinates, gradient: Gradient
-    ) -> tuple[Coordinates, Float[Array, " np"]]:
-        middle = 0.5 * (a.q + b.q)
-        change = self._pull(middle, self.inertia @ (b.v - a.v))
-        momentum = self.inertia @ (0.5 * (a.v + b.v))
-        gyroscopic = self.kinematics.gyroscopic(middle, momentum, h * rate, self.args)
-        if gyroscopic is not None:
-            change = change + gyroscopic
-        return change + gradient.impulse, gradient.rate
+        self, a: State, b: State, h: Scalar, rate: Increments, gradient: Gradient
+    ) -> tuple[Increments, Float[Array, " np"]]:
+        balance = self.kinematics.momentum_change(
+            a.q,
+            b.q,
+            self.inertia @ (b.v - a.v),
+            self.inertia @ (0.5 * (a.v + b.v)),
+            h * rate,
+            self.args,
+        )
+        balance = balance + self.kinematics.pull_back(a.q, b.q, gradient.impulse)
+        if gradient.rows is not None:
+            balance = balance + gradient.rows
+        return balance, gradient.rate
 
     def reaction_row(self, state: State, eta: JointMultipliers) -> Float[Array, " np"]:
         return jnp.zeros((0,), state.q.dtype)
+
+    def _mean_reaction(self, a: Position, b: Position, eta: JointMultipliers) -> Velocities:
+        return 0.5 * (self.reaction_at(*a, eta) + self.reaction_at(*b, eta))
+
+    def _reaction_of_step(
+        self, step: Increments, a: Position, b: Position, eta: JointMultipliers
+    ) -> Velocities:
+        """The reaction over the interval of a step; see `RigidKinematics.spin_rows`."""
+        assert isinstance(self.kinematics, RigidKinematics)
+        if eta.size == 0:
+            return jnp.zeros_like(step)
+        by_rate = self._mean_joint_force(a, b, eta)
+        momentum = self.kinematics.momentum_of_rates(a[0], step, by_rate)
+        return self.inverse_inertia @ momentum
+
+    def _mean_joint_force(
+        self, a: Position, b: Position, eta: JointMultipliers
+    ) -> Coordinates:
+        """The mean of `B^T eta` of the joints at two positions, shape `(nq,)`."""
+
+        def at(position: Position) -> Coordinates:
+            q, t = position
+            _, transpose = jax.vjp(lambda q: self.joint(q, t), q)
+            return transpose(eta)[0]
+
+        return 0.5 * (at(a) + at(b))
 
     def reaction_at(self, q: Coordinates, t: Time, eta: JointMultipliers) -> Velocities:
         """`M^-1 C(q, t)^T eta`; as `psi` is affine in `v`, the same for every `v`."""
@@ -227,10 +343,10 @@ class SeparableModel(AbstractModel):
         coordinate constraints. `m` is the mean inertia of a coordinate, so the result does
         not depend on the units of the constraints.
         """
-        if self.has_canonical_rates:
+        if self.has_canonical_rates or isinstance(self.kinematics, RigidKinematics):
             return self.inertia
         q = state.q
-        pull = jax.vmap(self._pull, in_axes=(None, 0))
+        pull = jax.vmap(self._momentum_rows, in_axes=(None, 0))
         inertia = pull(q, pull(q, as_dense(self.inertia)).T)
         rows = jax.jacfwd(self.coordinate)(q)
         unit = rows / jnp.linalg.norm(rows, axis=1, keepdims=True)
@@ -238,6 +354,11 @@ class SeparableModel(AbstractModel):
 
     def inverse_metric(self, state: State) -> Symmetric:
         return self.inverse_inertia
+
+    def coordinate_scale(self, step: Increments) -> Coordinates:
+        if not isinstance(self.kinematics, RigidKinematics):
+            return step
+        return self.kinematics.coordinate_scale(step)
 
     def stiffness(
         self, state: State, multipliers: Multipliers
@@ -280,18 +401,27 @@ class SeparableModel(AbstractModel):
 
     def constraint_matrix(self, q: Coordinates, t: Time) -> ConstraintMatrix:
         assert self.constraint_tables is not None
-        inverse_inertia, joint = self.inverse_inertia, lambda q: self.joint(q, t)
-        rows = schur(self.constraint_tables, joint, q, inverse_inertia)
-        return ConstraintMatrix(inverse_inertia, rows)
+        rates = self._rates_of_joints(q, t)
+        rest = jnp.zeros((self.inertia.shape[0],), q.dtype)
+        rows = schur(self.constraint_tables, rates, rest, self.inverse_inertia)
+        return ConstraintMatrix(self.inverse_inertia, rows)
+
+    def _rates_of_joints(
+        self, q: Coordinates, t: Time
+    ) -> Callable[[Velocities], JointMultipliers]:
+        return lambda v: self.joint_change(q, v, t)
 
     def _constraint_tables(self, state: State) -> SchurTables | None:
-        # Redundant constraints make the matrix singular.
         is_flat = self.has_canonical_rates and self.system.coordinate_constraint is None
-        if not is_flat or self.system.redundant:
+        # Redundant constraints make the matrix singular.
+        if self.system.redundant or not (
+            is_flat or isinstance(self.kinematics, RigidKinematics)
+        ):
             return None
         t = jnp.zeros((), state.q.dtype) if self.system.is_timed else None
-        joint = lambda q: self.joint(q, t)
-        return schur_tables(joint, state.q, self.inverse_inertia)
+        rest = jnp.zeros((self.inertia.shape[0],), state.q.dtype)
+        rates = self._rates_of_joints(state.q, t)
+        return schur_tables(rates, rest, self.inverse_inertia)
 
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
         """Solves the equations of motion with the joints at acceleration level.
@@ -301,9 +431,9 @@ class SeparableModel(AbstractModel):
         momentum.
         """
         q, v, t, scales = state.q, state.v, state.t, self.scales
-        qdot = self.lift(q, v)
+        qdot, rates = self.lift(q, v), self.rates(q, v)
         slope = self.slope(state)
-        gyroscopic = self.kinematics.gyroscopic(q, self.inertia @ v, qdot, self.args)
+        gyroscopic = self.kinematics.gyroscopic(q, self.inertia @ v, rates, self.args)
         if gyroscopic is not None:
             slope = slope + gyroscopic
         free_rate = self._free_joint_acceleration(state, qdot)
@@ -313,11 +443,12 @@ class SeparableModel(AbstractModel):
             acceleration, multipliers = unit * x[: v.size], x[v.size :] / scales.constraint
             # Evaluated in this function, because the sparsity pattern is found from index
             # arrays that are constants of the traced function.
-            pulled = self.pull(q, q, self.inertia @ acceleration)
-            pulled = pulled + self.constraint_force(q, t, multipliers)
+            pulled = self._momentum_rows(q, self.inertia @ acceleration)
+            joints = self.constraint_force(q, t, multipliers)
+            pulled = pulled + self.kinematics.pull_back(q, q, joints)
             rate = self.joint_change(q, acceleration, t) + free_rate
             rows = (
-                (pulled + slope) / scales.coordinate,
+                (pulled + slope) / scales.step,
                 rate / scales.constraint[: rate.size],
             )
             return jnp.concatenate(rows)

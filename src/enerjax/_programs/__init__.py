@@ -7,6 +7,7 @@ from .one_function.calls import in_one_function as in_one_function, unmerged as 
 from .one_function.possible import LARGEST_SUM as LARGEST_SUM
 from .one_function.products import plain_products as plain_products, summed as summed
 from .sparsity.jacobian_columns import (
+    batched_columns as batched_columns,
     columns_along as columns_along,
     jacobian_columns as jacobian_columns,
 )

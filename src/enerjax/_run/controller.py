@@ -17,7 +17,7 @@ from .._types import Count, Flag, Real, Scalar
 from ..schemes import AbstractScheme, AbstractSchemeWithMemory
 from .collocation import end_of, Pair, rates, rates_along
 from .prediction import for_length, with_history
-from .step import StepOutput, Warm
+from .step import Warm
 from .step_sizes import AbstractController, AbstractPlan, End, Verdict
 
 
@@ -174,13 +174,13 @@ class _ControlledPlan(AbstractPlan):
         self,
         memory: _Memory,
         model: AbstractModel,
-        begin: State,
-        out: StepOutput,
+        ends: tuple[State, State],
+        result: RESULTS,
         length: Scalar,
     ) -> Verdict:
-        known = _constant((model, begin, out.state, self.unit * length, memory.rates))
+        known = _constant((model, *ends, self.unit * length, memory.rates))
         error, reached = _constant(self._error(*known))
-        solved = out.result == RESULTS.successful
+        solved = result == RESULTS.successful
         accepted = solved & (error <= 1)
         power = 1 / estimate_order(self.order)
         error = jnp.maximum(error, _SMALLEST_ERROR)
@@ -196,7 +196,7 @@ class _ControlledPlan(AbstractPlan):
         accepted, next_length = checkpoint_name((accepted, next_length), ROOT)
         too_short = ~accepted & (next_length < jnp.finfo(length.dtype).eps ** 0.75)
         inaccurate = ~accepted & (solved | memory.inaccurate)
-        cause = RESULTS.where(inaccurate, RESULTS.steps_too_short, out.result)
+        cause = RESULTS.where(inaccurate, RESULTS.steps_too_short, result)
         before = jnp.concatenate([length[None], memory.before[:2]])
         choose = lambda new, old: jnp.where(accepted, new, old)
         after = _Memory(

@@ -5,6 +5,7 @@ for some steps, but it does for shorter ones. The energy identity holds for step
 length, so dividing a step costs nothing but its uniform length.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -17,7 +18,7 @@ from .._results import RESULTS
 from .._solvers import RootFinder, SMALL
 from .._system import State
 from .._types import Count, Flag, Scalar
-from ..schemes import AbstractOneSolveScheme, StepEnd
+from ..schemes import AbstractOneSolveScheme, AbstractSchemeWithMemory, StepEnd
 from .stage import first_memory, Memory, num_unknowns, solve, Solved
 
 
@@ -54,7 +55,9 @@ def solve_or_divide(
 
         def again():
             count, max_count = (2**times).astype(h.dtype), 2**max_halvings
-            new = _divided(scheme, model, start, h, root_finder, before, count, max_count)
+            new = _divided(
+                scheme, model, start, h, memory, root_finder, before, count, max_count
+            )
             return select(failed, (new, times), carry)
 
         return jax.lax.cond(in_any_lane(failed), again, lambda: carry), None
@@ -73,6 +76,7 @@ def _divided(
     model: AbstractModel,
     start: State,
     h: Scalar,
+    memory: Memory,
     root_finder: RootFinder,
     before: Solved,
     count: Scalar,
@@ -83,15 +87,14 @@ def _divided(
     `before` is the last attempt, which failed.
     """
     length = h / count
-
-    def begin(state: State, length: Scalar, with_chord: bool) -> Memory:
-        rates = model.accelerations(state)
-        return first_memory(scheme, model, state, length, *rates, with_chord=with_chord)
+    first_memory, last_memory = _memories(scheme, model, start, h, memory, count)
 
     def one_step(sofar: Solved, k: Scalar):
         unused = (sofar.result != RESULTS.successful) | (k >= count)
         state = _at_time(sofar.end.state, start, k * length)
-        new = solve(scheme, model, state, length, sofar.memory, root_finder, unused)
+        new = solve(
+            scheme, model, state, length, sofar.memory, root_finder, unused, rarely=True
+        )
         return select(unused, sofar, _joined(sofar, new, count)), None
 
     zero = jax.tree.map(jnp.zeros_like, before.end)
@@ -109,12 +112,53 @@ def _divided(
         residual=before.residual,
         result=RESULTS.successful,
         roughness=before.roughness,
-        # By Newton's method alone: a second program for rare steps would compile for long.
-        memory=begin(start, length, with_chord=False),
+        memory=first_memory,
     )
     done, _ = jax.lax.scan(one_step, first, jnp.arange(max_count, dtype=h.dtype))
     state = _at_time(done.end.state, start, h)
-    return eqx.tree_at(lambda done: done.memory, done, begin(state, h, with_chord=True))
+    return eqx.tree_at(lambda done: done.memory, done, last_memory(state, done.memory))
+
+
+def _memories(
+    scheme: AbstractOneSolveScheme,
+    model: AbstractModel,
+    start: State,
+    h: Scalar,
+    memory: Memory,
+    count: Scalar,
+) -> tuple[Memory, Callable[[State, Memory], Memory]]:
+    """The memory of the first of `count` equal steps, and that after the last of them.
+
+    The second is a function of the state at the end and the memory of the last short step.
+    The short steps use Newton's method alone, because a chord method for these rare steps
+    would take long to compile.
+    """
+    if isinstance(scheme, AbstractSchemeWithMemory):
+
+        def begin(state: State, length: Scalar) -> Memory:
+            return first_memory(scheme, model, state, length, *model.accelerations(state))
+
+        return begin(start, h / count), lambda state, last: begin(state, h)
+    # What a step adds to a free flight is proportional to its length.
+    scaled = lambda factor, added: jax.tree.map(lambda x: factor * x, added)
+    by_newton = Memory(
+        added=scaled(1 / count, memory.added),
+        is_smooth=jnp.array(False),
+        factors=memory.factors,
+        chord_wait=None,
+        carried=memory.carried,
+    )
+
+    def after(_: State, last: Memory) -> Memory:
+        return Memory(
+            added=scaled(count, last.added),
+            is_smooth=jnp.array(False),
+            factors=last.factors,
+            chord_wait=memory.chord_wait,
+            carried=last.carried,
+        )
+
+    return by_newton, after
 
 
 def _at_time(state: State, start: State, passed: Scalar) -> State:

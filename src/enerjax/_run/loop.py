@@ -53,7 +53,7 @@ class Stepper(eqx.Module):
             state=State(start.q, start.v),
             warm=first_warm(scheme, model, start, h, acceleration, multipliers),
             place=place,
-            memory=plan.begin(model, timed),
+            memory=plan.begin(model.in_rates, model.to_rates(timed)),
             result=_check_start(scheme, model, timed, h),
             completed=jnp.array(0),
             multipliers=multipliers,
@@ -76,7 +76,8 @@ class Stepper(eqx.Module):
             ~live,
             self.max_halvings,
         )
-        verdict = plan.judge(before.memory, model, begin, out, length)
+        ends = model.to_rates(begin), model.to_rates(out.state)
+        verdict = plan.judge(before.memory, model.in_rates, ends, out.result, length)
         good = live & verdict.accepted
         result = RESULTS.where(live, verdict.result, RESULTS.successful)
         keep = lambda new, old: select(good, new, old)

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from .._operators import make_model
 from .._solvers import Newton, RootFinder
 from .._system import AbstractSystem, State
 from .._types import Args, Real, Scalar
@@ -18,6 +17,7 @@ from .inputs import check_halvings, prepare
 from .loop import run_loop, Stepper
 from .saving import AbstractSaving, RecordedRun, SaveAt, SaveFunction, saving_of
 from .solution import Solution, Statistics
+from .step import model_for
 from .step_sizes import AbstractController, AbstractPlan, EqualSteps, find_end
 
 
@@ -127,22 +127,26 @@ class _Task(eqx.Module):
 def _run(task: _Task) -> tuple[Solution, Scalar]:
     """The run, and the time that it has reached."""
     plan, saving, fn = task.plan, task.saving, task.fn
-    model = make_model(task.system, task.start, task.args)
+    model = model_for(task.scheme, task.system, task.start, task.args)
 
     def observe(state: State, t: Scalar) -> tuple[PyTree[Any], Measures]:
-        """The user's form of a state, or the value of `fn`, and its part of the audit."""
-        value: PyTree[Any] = model.to_user(state)
+        """The user's form of a state, or the value of `fn`, and its part of the audit.
+
+        The state is one of `model.in_rates`.
+        """
+        value: PyTree[Any] = model.in_rates.to_user(state)
         if fn is not None:
             value = jax.tree.map(jnp.asarray, fn(t, value, task.args))
         timed = State(state.q, state.v, t if task.system.is_timed else None)
-        return value, measures(model, timed)
+        return value, measures(model.in_rates, timed)
 
     # With `fn` states are observed in the loop, so that they need not be stored. Otherwise
     # they are observed together after the loop, which is faster.
     in_loop = fn is not None and saving.keeps_rows
 
     def keep(state: State, place: Scalar) -> PyTree[Any]:
-        return observe(state, plan.time(place)) if in_loop else state
+        kept = model.to_rates(state)
+        return observe(kept, plan.time(place)) if in_loop else kept
 
     stepper = Stepper(
         scheme=task.scheme,
@@ -154,7 +158,7 @@ def _run(task: _Task) -> tuple[Solution, Scalar]:
     start = model.to_internal(task.start)
     begin, end, record = run_loop(stepper, start, saving.steps_in_group(plan), keep)
     run = RecordedRun(
-        model=model,
+        model=model.in_rates,
         plan=plan,
         begin=begin,
         record=record,
@@ -166,7 +170,7 @@ def _run(task: _Task) -> tuple[Solution, Scalar]:
     solution = Solution(
         ts=rows.ts,
         ys=ys,
-        multipliers=rows.multipliers,
+        multipliers=jax.vmap(model.user_multipliers)(rows.multipliers),
         details=rows.details,
         audit=audit(measured, rows.energies),
         stats=Statistics(

@@ -6,6 +6,7 @@ guesses are the unknowns of a free flight, which is a step without forces, plus 
 extrapolation of the differences between the last steps and their free flights.
 """
 
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -15,6 +16,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from .._operators import AbstractModel, Increment, roughness, scales_like, shortened
+from .._programs import in_one_function
 from .._results import first_failure, from_root_finder, RESULTS
 from .._solvers import (
     AbstractFactors,
@@ -96,9 +98,8 @@ def first_memory(
     h: Scalar,
     acceleration: Velocities,
     multipliers: Multipliers,
-    with_chord: bool = True,
 ) -> Memory:
-    """The memory at the start of a run; `with_chord=False` excludes the chord method."""
+    """The memory at the start of a run."""
     carried = None
     if isinstance(scheme, AbstractSchemeWithMemory):
         carried = scheme.begin(model, start, h, acceleration)
@@ -109,8 +110,7 @@ def first_memory(
     added = jax.lax.stop_gradient(added)
     flat, _ = ravel_pytree(flight)
     has_chord = (
-        with_chord
-        and flat.size > _FEW
+        flat.size > _FEW
         and isinstance(scheme, AbstractSchemeWithChord)
         and model.has_constraint_matrix
     )
@@ -146,53 +146,107 @@ def solve(
     memory: Memory,
     root_finder: RootFinder,
     skip: Flag,
+    *,
+    rarely: bool = False,
 ) -> Solved:
     """Solves a step of length `h`. With `skip` it makes no iteration; see `find_root`."""
     problem = _problem(scheme, model, start, h, memory.carried)
-    flight = _free_flight(scheme, problem, model, start)
-    unknown_scale, row_scale, least = scales_like(flight, model, start, h)
+    # The parts of a step are compiled as one function each, because the search may not be.
+    prepared = in_one_function(
+        lambda: _prepared(scheme, problem, model, start, h, memory)
+    )()
+    unknown_scale, row_scale = prepared.unknown_scale, prepared.row_scale
 
     def scaled(x, inputs):
         scheme, problem, unknown_scale, row_scale = inputs
         z = jax.tree.map(jnp.multiply, x, unknown_scale)
         return jax.tree.map(jnp.divide, scheme.residual(z, problem), row_scale)
 
-    inputs = (scheme, problem, unknown_scale, row_scale)
-
-    guess = jax.tree.map(
-        lambda x0, x, s: (x0 + x) / s, flight, _predicted(memory), unknown_scale
-    )
-    scale_down = lambda z: jax.tree.map(jnp.divide, z, unknown_scale)
     wait = memory.chord_wait
     root = find_root(
         scaled,
         root_finder,
-        guess,
-        inputs,
+        prepared.guess,
+        (scheme, problem, unknown_scale, row_scale),
         max_iterations=MAX_ITERATIONS,
-        # The extrapolated guess can lie beyond a fold of the step equations. A free flight
-        # usually does not, and a fraction of it does not if bodies rotate far in a step.
-        others=[scale_down(shortened(flight, part)) for part in (1.0, 0.5, 0.25)],
-        factors=jax.tree.map(_extrapolated, memory.factors),
+        others=prepared.others,
+        factors=prepared.factors,
         skip=skip,
         regularisation=_regularisation(model, unknown_scale, row_scale),
-        least=least,
+        least=prepared.least,
         chord=None if wait is None else _chord(scheme),
         by_chord=True if wait is None else wait == 0,
+        rarely=rarely or wait is not None,
     )
-    z = jax.tree.map(jnp.multiply, root.value, unknown_scale)
+    solved = lambda: _solved(scheme, problem, model, start, memory, prepared, root)
+    return in_one_function(solved)()
+
+
+class _Prepared(eqx.Module):
+    """The data of a search: scales, guesses and factors. `flight` is a free flight."""
+
+    flight: PyTree[Any]
+    unknown_scale: PyTree[Any]
+    row_scale: PyTree[Any]
+    least: Scalar
+    guess: PyTree[Any]
+    others: tuple[PyTree[Any], ...]
+    factors: AbstractFactors | None
+
+
+def _prepared(
+    scheme: AbstractOneSolveScheme,
+    problem: Any,
+    model: AbstractModel,
+    start: State,
+    h: Scalar,
+    memory: Memory,
+) -> _Prepared:
+    flight = _free_flight(scheme, problem, model, start)
+    unknown_scale, row_scale, least = scales_like(flight, model, start, h)
+    scaled = lambda z: jax.tree.map(jnp.divide, z, unknown_scale)
+    return _Prepared(
+        flight=flight,
+        unknown_scale=unknown_scale,
+        row_scale=row_scale,
+        least=least,
+        guess=scaled(jax.tree.map(jnp.add, flight, _predicted(memory))),
+        # The extrapolated guess can lie beyond a fold of the step equations. A free flight
+        # usually does not, and a fraction of it does not if bodies rotate far in a step.
+        others=tuple(scaled(shortened(flight, part)) for part in (1.0, 0.5, 0.25)),
+        factors=jax.tree.map(_extrapolated, memory.factors),
+    )
+
+
+def _solved(
+    scheme: AbstractOneSolveScheme,
+    problem: Any,
+    model: AbstractModel,
+    start: State,
+    memory: Memory,
+    prepared: _Prepared,
+    root: Root,
+) -> Solved:
+    """The result of a step whose search has ended with `root`."""
+    z = jax.tree.map(jnp.multiply, root.value, prepared.unknown_scale)
     end = scheme.finish(z, problem)
+    reverses = lambda: _gradients_reverse(model, start, end.state)
+    if memory.chord_wait is not None:
+        # Where the chord method converges, the gradients have hardly changed.
+        reverses = functools.partial(
+            jax.lax.cond, root.by_chord, lambda: jnp.array(False), reverses
+        )
+    branch = RESULTS.where(reverses(), RESULTS.step_too_large, RESULTS.successful)
     found = from_root_finder(root.found, root.broken, root.finite)
-    reverses = _gradients_reverse(model, start, end.state)
-    branch = RESULTS.where(reverses, RESULTS.step_too_large, RESULTS.successful)
-    added = jax.lax.stop_gradient(jax.tree.map(jnp.subtract, z, flight))
+    added = jax.lax.stop_gradient(jax.tree.map(jnp.subtract, z, prepared.flight))
+    sizes = model.scales.step, added, memory.added, prepared.unknown_scale
     return Solved(
         end=end,
         iterations=root.iterations,
         residual=root.residual,
         result=first_failure(first_failure(end.result, found), branch),
-        roughness=roughness(model.scales.coordinate, added, memory.added, unknown_scale),
-        memory=_memory_after(memory, added, unknown_scale, root, end.carried),
+        roughness=roughness(*sizes),
+        memory=_memory_after(memory, added, prepared.unknown_scale, root, end.carried),
     )
 
 

@@ -13,7 +13,7 @@ from .._results import first_of, RESULTS
 from .._solvers import largest, Newton, RootFinder
 from .._system import AbstractSystem, State
 from .._types import Args, Coordinates, Count, Flag, Multipliers, Real, Scalar, Velocities
-from ..schemes import AbstractScheme, Energies
+from ..schemes import AbstractScheme, AbstractSchemeWithRotations, Energies
 from .halving import solve_or_divide
 from .inputs import check_halvings, prepare
 from .stage import first_memory, Memory
@@ -62,6 +62,14 @@ class StepOutput(eqx.Module):
     local_error: Scalar
     result: RESULTS
     warm: Warm
+
+
+def model_for(
+    scheme: AbstractScheme, system: AbstractSystem, state: State, args: Args
+) -> AbstractModel:
+    """The model of a system for a scheme, which may move rigid bodies by rotations."""
+    rotates = isinstance(scheme.stage, AbstractSchemeWithRotations)
+    return make_model(system, state, args, rotates=rotates)
 
 
 def first_warm(
@@ -145,7 +153,7 @@ def _sum_and_rest(x: Array, y: Array) -> tuple[Array, Array]:
 
 @eqx.filter_jit
 def _single_step(system, scheme, state, args, h, warm, root_finder, max_halvings):
-    model = make_model(system, state, args)
+    model = model_for(scheme, system, state, args)
     state = model.to_internal(state)
     fresh = lambda: first_warm(scheme, model, state, h, *model.accelerations(state))
     if warm is None:
@@ -158,7 +166,8 @@ def _single_step(system, scheme, state, args, h, warm, root_finder, max_halvings
     no = jnp.array(False)
     go = lambda: advance(scheme, model, state, h, warm, root_finder, no, max_halvings)
     out = in_one_function(go)()
-    return eqx.tree_at(lambda out: out.state, out, model.to_user(out.state))
+    user = model.to_user(out.state), model.user_multipliers(out.multipliers)
+    return eqx.tree_at(lambda out: (out.state, out.multipliers), out, user)
 
 
 def _types(tree: PyTree[Any]) -> Any:

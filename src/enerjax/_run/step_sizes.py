@@ -15,7 +15,7 @@ from .._system import State
 from .._types import Flag, Real, Scalar
 from ..schemes import AbstractScheme
 from .inputs import positive_integer
-from .step import StepOutput, Warm
+from .step import Warm
 
 
 class Verdict(eqx.Module):
@@ -77,11 +77,11 @@ class AbstractPlan(eqx.Module):
         self,
         memory: PyTree[Any],
         model: AbstractModel,
-        begin: State,
-        out: StepOutput,
+        ends: tuple[State, State],
+        result: RESULTS,
         length: Scalar,
     ) -> Verdict:
-        """The decision about a step of this length from `begin`."""
+        """The decision about a step of this length between the states `ends`."""
 
     @abc.abstractmethod
     def num_rejected(self, memory: PyTree[Any]) -> Any:
@@ -175,11 +175,11 @@ class _EqualPlan(AbstractPlan):
         self,
         memory: None,
         model: AbstractModel,
-        begin: State,
-        out: StepOutput,
+        ends: tuple[State, State],
+        result: RESULTS,
         length: Scalar,
     ) -> Verdict:
-        return Verdict(out.result == RESULTS.successful, out.result, None)
+        return Verdict(result == RESULTS.successful, result, None)
 
     def num_rejected(self, memory: None) -> None:
         return None

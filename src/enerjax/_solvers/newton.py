@@ -89,6 +89,8 @@ class Start(eqx.Module):
     - `by_chord`: whether to try the chord method first, where the equations have one.
     - `regularisation`: the numbers added to the diagonal of a Jacobian that may be
       singular, one for each unknown; see `find_root`.
+    - `rarely`: whether Jacobians are needed rarely, so that a program is chosen that
+      compiles quickly.
     - `least`: the scaled size below which unknowns are round-off. Corrections are measured
       relative to the largest unknown, but to no less than this.
     """
@@ -100,3 +102,4 @@ class Start(eqx.Module):
     by_chord: Flag
     regularisation: PyTree[Array] | None
     least: Scalar
+    rarely: bool = eqx.field(static=True, default=False)

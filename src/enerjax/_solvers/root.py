@@ -53,7 +53,9 @@ def _root_jvp(primals, tangents):
     _, rate = jax.jvp(by_args, (moved,), (t_args,))
     linear_solver = root_finder.linear_solver if isinstance(root_finder, Newton) else None
     regularisation = flat_of(args[-1])
-    linear = linearisable(flat_fn, flat, args, linear_solver, regularisation)
+    linear = linearisable(
+        flat_fn, flat, args, linear_solver, regularisation, rarely=start.rarely
+    )
     change = linear.solve(flat, -rate)
     if regularisation is not None:
         change = change + _null_space_rate(linear, flat_fn, flat, (moved, fixed), t_args)
@@ -103,6 +105,7 @@ def find_root(
     least: Scalar | float = 1.0,
     chord: Chord | None = None,
     by_chord: Flag | bool = True,
+    rarely: bool = False,
 ) -> Root:
     """A root of `fn(y, args)`. Failures are reported in the `Root`, not raised.
 
@@ -122,7 +125,8 @@ def find_root(
 
     With a `chord`, and if `by_chord` is true, `Newton` first tries the chord method, and
     uses the exact Jacobian only where that fails. The root and its derivatives are those of
-    `fn` in either case.
+    `fn` in either case. If Jacobians are needed `rarely`, their program is one that
+    compiles quickly.
     """
     flat, _ = ravel_pytree(guess)
     start = Start(
@@ -133,6 +137,7 @@ def find_root(
         by_chord=jnp.asarray(by_chord),
         regularisation=regularisation,
         least=jnp.asarray(least, flat.dtype),
+        rarely=rarely,
     )
     start = jax.lax.stop_gradient(start)
     traced, opened = _explicit_closure(fn, guess, args)

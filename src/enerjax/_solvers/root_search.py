@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 from typing_extensions import TypeAliasType
 
-from .._programs import in_one_function
+from .._programs import in_one_function, unmerged
 from .._types import Count, Flag, Scalar
 from .chord_iterations import chord_iterations
 from .linear.dense import AbstractFactors, Inverse
@@ -102,11 +102,13 @@ def search(
         )
     flat, _, flat_fn = flattened(fn, start.guess)
     linear_solver, regularisation = root_finder.linear_solver, flat_of(start.regularisation)
-    exact = linearisable(flat_fn, flat, args, linear_solver, regularisation)
+    exact = linearisable(
+        flat_fn, flat, args, linear_solver, regularisation, rarely=start.rarely
+    )
     if chord is None or linear_solver is not None:
         return _iterated(exact, root_finder, start, max_iterations)
     # Separate from the Newton search, which may not be compilable into one function.
-    by_chord = lambda: _by_chord(exact, chord, root_finder, args, start)
+    by_chord = lambda: _by_chord(fn, chord, root_finder, args, start)
     first = in_one_function(by_chord)()
 
     def again() -> Root:
@@ -122,12 +124,27 @@ def search(
 
 
 def _by_chord(
-    residual: Linearisable, chord: Chord, newton: Newton, args: PyTree, start: Start
+    fn: Callable[[PyTree[Array], Any], PyTree[Array]],
+    chord: Chord,
+    newton: Newton,
+    args: PyTree,
+    start: Start,
 ) -> Root:
     guess, unravel = ravel_pytree(start.guess)
     prepared = chord.prepare(start.guess, args)
-    solve = lambda right: ravel_pytree(chord.correct(unravel(right), args, prepared))[0]
-    last = chord_iterations(residual.value, solve, newton, start, guess)
+    leaves_of = lambda tree: tuple(jax.tree.leaves(tree))
+    joined = lambda leaves: jnp.concatenate([x.ravel() for x in leaves])
+
+    # Compiled separately: XLA would otherwise evaluate parts of the residual again for each
+    # of its uses.
+    def value(x: Array) -> Array:
+        return joined(unmerged(lambda x: leaves_of(fn(unravel(x), args)))(x))
+
+    def solve(right: Array) -> Array:
+        correct = lambda x: leaves_of(chord.correct(unravel(x), args, prepared))
+        return joined(unmerged(correct)(right))
+
+    last = chord_iterations(value, solve, newton, start, guess)
     return Root(
         value=unravel(last.x),
         factors=start.factors,

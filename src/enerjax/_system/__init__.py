@@ -21,4 +21,5 @@ from .kinematics import (
     AbstractKinematics as AbstractKinematics,
     IdentityKinematics as IdentityKinematics,
 )
+from .rigid_bodies import RigidBodies as RigidBodies, RigidKinematics as RigidKinematics
 from .separable import System as System

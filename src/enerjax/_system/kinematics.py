@@ -1,7 +1,17 @@
-"""The linear map `L` in `v = L(q) qdot`, its transpose and its inverse.
+"""Kinds of coordinates: how velocities and the increments of a step move them.
 
-The inverse `qdot = L^+ v`, which is called `lift`, solves `L qdot = v` together with
-`B_c qdot = 0`, where `B_c` is the Jacobian of the coordinate constraints.
+A step from `q_a` to `q_b` has the unknowns `step`, a displacement. A kind of coordinates
+consists of four maps:
+
+- the displacement `q_b - q_a = P step`, where `P` may depend on `q_a` and `step`, so that
+  `q_b` is a retraction of the step; the transpose of `P` pulls gradients with
+  respect to `q` back to the rows of the step equations;
+- the velocity `Lm step`, which is the mean velocity of the step times its duration;
+- the change of momentum in these rows, such that its product with `step` is the change of
+  the kinetic energy.
+
+For plain coordinates all of them are trivial. Bodies in space whose increments are
+rotations have their own file, `rigid_bodies.py`.
 """
 
 import abc
@@ -21,11 +31,11 @@ from .._solvers import (
     multiply_by_blocks,
     solve_by_blocks,
 )
-from .._types import Args, Coordinates, Velocities
+from .._types import Args, Coordinates, Increments, Velocities
 
 
 class AbstractKinematics(eqx.Module):
-    """The map `L(q)` from rates of coordinates to velocities, `nv x nq`."""
+    """A kind of coordinates `q` with velocities `v = L(q) qdot`."""
 
     @abc.abstractmethod
     def with_blocks(
@@ -37,12 +47,36 @@ class AbstractKinematics(eqx.Module):
         """The same map, with the independent blocks of `L` stacked on `B_c`."""
 
     @abc.abstractmethod
-    def push(self, q: Coordinates, rate: Coordinates, args: Args) -> Velocities:
-        """`L(q) rate`"""
+    def displacement(self, q: Coordinates, step: Increments) -> Coordinates:
+        """`P step`, the change of the coordinates in a step from `q`."""
 
     @abc.abstractmethod
-    def pull(self, q: Coordinates, momentum: Velocities, args: Args) -> Coordinates:
-        """`L(q)^T momentum`"""
+    def pull_back(
+        self, qa: Coordinates, qb: Coordinates, gradient: Coordinates
+    ) -> Increments:
+        """`P^T gradient`, the rows of a gradient with respect to the coordinates."""
+
+    @abc.abstractmethod
+    def push(
+        self, qa: Coordinates, qb: Coordinates, step: Increments, args: Args
+    ) -> Velocities:
+        """`Lm step`, the mean velocity of a step times its duration."""
+
+    @abc.abstractmethod
+    def pull(
+        self, qa: Coordinates, qb: Coordinates, force: Velocities, args: Args
+    ) -> Increments:
+        """The rows of a force that is conjugate to the velocities of the user."""
+
+    @abc.abstractmethod
+    def rates(
+        self,
+        q: Coordinates,
+        v: Velocities,
+        coordinate_jacobian: Callable[[Coordinates], Float[Array, "ncc nq"]],
+        args: Args,
+    ) -> Increments:
+        """The steps per time, for steps of zero length, of a motion with velocity `v`."""
 
     @abc.abstractmethod
     def lift(
@@ -52,13 +86,36 @@ class AbstractKinematics(eqx.Module):
         coordinate_jacobian: Callable[[Coordinates], Float[Array, "ncc nq"]],
         args: Args,
     ) -> Coordinates:
-        """`L(q)^+ v`"""
+        """`L(q)^+ v`, the rates of the coordinates.
+
+        It solves `L qdot = v` together with `B_c qdot = 0`, where `B_c` is the Jacobian of
+        the coordinate constraints.
+        """
+
+    @abc.abstractmethod
+    def momentum_rows(self, q: Coordinates, momentum: Velocities, args: Args) -> Increments:
+        """The rows of a momentum at a position."""
+
+    @abc.abstractmethod
+    def momentum_change(
+        self,
+        qa: Coordinates,
+        qb: Coordinates,
+        change: Velocities,
+        mean: Velocities,
+        step: Increments,
+        args: Args,
+    ) -> Increments:
+        """The rows of the change of momentum in a step, including gyroscopic terms.
+
+        `change` and `mean` are the difference and the mean of the momenta at the ends.
+        """
 
     @abc.abstractmethod
     def gyroscopic(
-        self, q: Coordinates, momentum: Velocities, dq: Coordinates, args: Args
-    ) -> Coordinates | None:
-        """`G(q, momentum) dq`, or `None` if `L` does not depend on `q`."""
+        self, q: Coordinates, momentum: Velocities, rates: Increments, args: Args
+    ) -> Increments | None:
+        """The rows of the rate of change of momentum at constant velocities, or `None`."""
 
 
 class IdentityKinematics(AbstractKinematics):
@@ -67,16 +124,31 @@ class IdentityKinematics(AbstractKinematics):
     def with_blocks(self, q, coordinate, args):
         return self
 
-    def push(self, q, rate, args):
-        return rate
+    def displacement(self, q, step):
+        return step
 
-    def pull(self, q, momentum, args):
-        return momentum
+    def pull_back(self, qa, qb, gradient):
+        return gradient
+
+    def push(self, qa, qb, step, args):
+        return step
+
+    def pull(self, qa, qb, force, args):
+        return force
+
+    def rates(self, q, v, coordinate_jacobian, args):
+        return v
 
     def lift(self, q, v, coordinate_jacobian, args):
         return v
 
-    def gyroscopic(self, q, momentum, dq, args):
+    def momentum_rows(self, q, momentum, args):
+        return momentum
+
+    def momentum_change(self, qa, qb, change, mean, step, args):
+        return change
+
+    def gyroscopic(self, q, momentum, rates, args):
         return None
 
 
@@ -96,25 +168,46 @@ class ConfigurationKinematics(AbstractKinematics):
         blocks = independent_blocks(np.concatenate([of_rates, of_relations]))
         return ConfigurationKinematics(self.matrix, blocks)
 
-    def push(self, q, rate, args):
-        matrix = self.matrix(q, args)
-        if self.blocks is None:
-            return matrix @ rate
-        square = jnp.pad(matrix, ((0, q.size - len(matrix)), (0, 0)))
-        return multiply_by_blocks(self.blocks, square, rate)[: len(matrix)]
+    def displacement(self, q, step):
+        return step
 
-    def pull(self, q, momentum, args):
-        if self.blocks is None:
-            return momentum @ self.matrix(q, args)
-        _, pull = jax.vjp(lambda rate: self.push(q, rate, args), jnp.zeros_like(q))
-        return pull(momentum)[0]
+    def pull_back(self, qa, qb, gradient):
+        return gradient
+
+    def push(self, qa, qb, step, args):
+        return self._push(0.5 * (qa + qb), step, args)
+
+    def pull(self, qa, qb, force, args):
+        return self.momentum_rows(0.5 * (qa + qb), force, args)
+
+    def rates(self, q, v, coordinate_jacobian, args):
+        return self.lift(q, v, coordinate_jacobian, args)
 
     def lift(self, q, v, coordinate_jacobian, args):
         square = jnp.concatenate([self.matrix(q, args), coordinate_jacobian(q)])
         return solve_by_blocks(self.blocks, square, jnp.pad(v, (0, q.size - v.size)))
 
-    def gyroscopic(self, q, momentum, dq, args):
+    def momentum_rows(self, q, momentum, args):
+        if self.blocks is None:
+            return momentum @ self.matrix(q, args)
+        _, pull = jax.vjp(lambda step: self._push(q, step, args), jnp.zeros_like(q))
+        return pull(momentum)[0]
+
+    def momentum_change(self, qa, qb, change, mean, step, args):
+        middle = 0.5 * (qa + qb)
+        rows = self.momentum_rows(middle, change, args)
+        return rows + self.gyroscopic(middle, mean, step, args)
+
+    def gyroscopic(self, q, momentum, rates, args):
         # G_ij = sum_k mu_k (dL_ki/dq_j - dL_kj/dq_i), paper eq. (11), so G dq is the change
         # of L^T mu along dq minus the gradient of mu . L dq.
-        _, along = jax.jvp(lambda x: self.pull(x, momentum, args), (q,), (dq,))
-        return along - jax.grad(lambda x: momentum @ self.push(x, dq, args))(q)
+        pulled = lambda x: self.momentum_rows(x, momentum, args)
+        _, along = jax.jvp(pulled, (q,), (rates,))
+        return along - jax.grad(lambda x: momentum @ self._push(x, rates, args))(q)
+
+    def _push(self, q: Coordinates, step: Increments, args: Args) -> Velocities:
+        matrix = self.matrix(q, args)
+        if self.blocks is None:
+            return matrix @ step
+        square = jnp.pad(matrix, ((0, q.size - len(matrix)), (0, 0)))
+        return multiply_by_blocks(self.blocks, square, step)[: len(matrix)]

@@ -1,9 +1,13 @@
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
 
+from .._programs import Indices
 from .._solvers import BlockDiagonal, hessian, in_blocks, Symmetric
 from .._types import Args, Coordinates, Scalar, Vector, Velocities
 from .base import (
@@ -23,6 +27,7 @@ from .base import (
 )
 from .canonical import HamiltonianSystem, LagrangianSystem
 from .kinematics import AbstractKinematics, ConfigurationKinematics, IdentityKinematics
+from .rigid_bodies import body_table, RigidBodies, RigidKinematics
 
 
 class System(AbstractSystem):
@@ -57,6 +62,16 @@ class System(AbstractSystem):
     - `redundant`: whether constraints may be redundant, as in over-constrained mechanisms.
       Multipliers then have the least norm (each in the measure of its constraint), to the
       order of the scheme; the motion does not depend on this choice.
+    - `rigid_bodies`: the indices of the coordinates of each rigid body in space, shape
+      `(bodies, 12)`: its mass centre, then its three body axes as vectors in space (the
+      directors). Leave it out if there is none. The library keeps the axes orthonormal, so
+      write no constraints for that. Velocities are the rates of all coordinates, and the
+      kinetic energy of a body is `m |xdot|^2/2 + sum_ij E_ij d_i_dot . d_j_dot/2` with
+      `E = tr(J)/2 I - J` and the inertia `J` in body axes. `EnergyPreserving`,
+      `EnergyDecaying` and their compositions move these bodies by rotations, with six
+      unknowns each, and conserve angular momentum to round-off where rotations change
+      neither the potential nor the constraints. Other schemes impose six constraints on
+      each body, whose multipliers follow those of `constraint`.
 
     `args` is any pytree; the functions must be smooth and written with `jax.numpy`.
 
@@ -74,6 +89,7 @@ class System(AbstractSystem):
     driven: Driven | None
     symmetry: Symmetry | None
     redundant: bool = eqx.field(static=True)
+    rigid_bodies: Indices | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -87,7 +103,13 @@ class System(AbstractSystem):
         driven: Driven | None = None,
         symmetry: Symmetry | None = None,
         redundant: bool = False,
+        rigid_bodies: Any = None,
     ):
+        if rigid_bodies is not None and kinematics is not None:
+            raise ValueError(
+                "`System(rigid_bodies=...)` with `kinematics`: the velocities of a system "
+                "with rigid bodies are the rates of its coordinates. Leave one of them out."
+            )
         if kinematics is not None:
             check_function("kinematics", kinematics, SIGNATURES["kinematics"])
         if coordinate_constraint is not None and kinematics is None:
@@ -112,6 +134,7 @@ class System(AbstractSystem):
         self.driven = driven
         self.symmetry = symmetry
         self.redundant = redundant
+        self.rigid_bodies = None if rigid_bodies is None else body_table(rigid_bodies)
         self.kinematics = (
             IdentityKinematics()
             if kinematics is None
@@ -134,6 +157,32 @@ class System(AbstractSystem):
     def energy(self, state: State, args: Args = None) -> Scalar:
         """Total energy `1/2 v . M v + V(q)` of one state."""
         return self.kinetic_energy(state, args) + self.potential_energy(state, args)
+
+    def bodies(self, q: Coordinates) -> RigidBodies | None:
+        """The tables of the rigid bodies; `None` if there are none."""
+        if self.rigid_bodies is None:
+            return None
+        return RigidBodies(self.rigid_bodies.array, q.size)
+
+    def internal(self, q: Coordinates) -> Float[Array, " 6*bodies"]:
+        """The constraints that keep the directors of rigid bodies orthonormal."""
+        bodies = self.bodies(q)
+        return q[:0] if bodies is None else bodies.internal(q)
+
+    def inertia_of_rotations(
+        self, bodies: RigidBodies, args: Args, dtype: Any
+    ) -> Symmetric:
+        """`M` for the velocities of `RigidKinematics`, with one block for each body."""
+        kinematics, q = RigidKinematics(bodies), bodies.at_rest(dtype)
+
+        def energy(v: Velocities) -> Scalar:
+            rates = kinematics.lift(q, v, lambda q: q[None, :0], args)
+            return self.kinetic_energy(State(q, rates), args)
+
+        together = np.arange(bodies.num_velocities)
+        together[bodies.v] = bodies.v[:, :1]
+        at_rest = jnp.zeros((bodies.num_velocities,), dtype)
+        return hessian(energy, at_rest, together)
 
     def inertia(self, state: State, args: Args) -> Symmetric:
         """`M`, constant."""

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from .._types import Coordinates, Multipliers, Scalar, Velocities
@@ -22,7 +21,7 @@ class AbstractBodyCoordinates(abc.ABC):
     - `dimension`: 2 in the plane, 3 in space.
     - `turns`: whether the body has an orientation.
     - `num_coordinates`, `num_velocities`: of one body.
-    - `num_internal`: constraints between its coordinates whose rate must vanish too.
+    - `num_internal`: constraints between its directors, which `System` adds.
     - `num_redundant`: relations between its coordinates whose rate vanishes for every `v`.
     """
 
@@ -54,10 +53,6 @@ class AbstractBodyCoordinates(abc.ABC):
     @abc.abstractmethod
     def kinetic(self, v: Velocities, numbers: Numbers) -> Scalar:
         """The kinetic energy, quadratic in `v`."""
-
-    def internal(self, q: Coordinates) -> Multipliers:
-        """The internal constraints, `num_internal` rows."""
-        return jnp.zeros((0,), q.dtype)
 
     def redundant(self, q: Coordinates) -> Multipliers:
         """The relations between redundant coordinates, `num_redundant` rows."""
@@ -113,10 +108,6 @@ class PlanarBodies(AbstractBodyCoordinates):
         return translation(v[:2], numbers) + 0.5 * numbers["inertia"] * v[2] ** 2
 
 
-# The six pairs of three axes.
-_LEFT, _RIGHT = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
-
-
 @dataclass(frozen=True)
 class DirectorBodies(AbstractBodyCoordinates):
     """`q`: mass centre and the three body axes, as vectors in space."""
@@ -138,11 +129,6 @@ class DirectorBodies(AbstractBodyCoordinates):
         moments = 0.5 * jnp.trace(inertia) * jnp.eye(3, dtype=v.dtype) - inertia
         turning = 0.5 * jnp.sum(moments * (rates @ rates.T))
         return translation(v[:3], numbers) + turning
-
-    def internal(self, q):
-        axes = self.axes(q)
-        products = jnp.sum(axes[np.array(_LEFT)] * axes[np.array(_RIGHT)], axis=1)
-        return products - jnp.array([1, 1, 1, 0, 0, 0], q.dtype)
 
 
 def rotation(p: Float[Array, "4"]) -> Float[Array, "3 3"]:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._types import Coordinates, Real
-from ._functions import constraint, driven, drives_at, redundancy
+from ._functions import constraint, driven, drives_at, internal, redundancy
 from ._layout import Layout
 from ._parameters import Parameters
 from ._pose_view import evaluate, View
@@ -35,16 +35,13 @@ def rows_of(layout: Layout, q: Coordinates, args: Parameters) -> dict[str, slice
         pairs = drives_at(layout, jnp.zeros((), q.dtype), args)
         return [evaluate(group, view, numbers) for group, numbers in pairs]
 
-    def of_all(q: Coordinates) -> Array:
-        return constraint(layout, q, args)
-
     shapes = [x.shape for x in jax.eval_shape(of_joints, q)]
     num_joined = len(shapes)
     shapes += [x.shape for x in jax.eval_shape(of_drives, q)]
     places, first = {}, 0
     for k, (names, shape) in enumerate(zip(members(layout), shapes, strict=True)):
-        if k == num_joined and layout.has_constraints:
-            first = jax.eval_shape(of_all, q).size
+        if k == num_joined:
+            first += layout.num_internal
         for name in names:
             places[name] = slice(first, first + shape[1])
             first += shape[1]
@@ -70,7 +67,10 @@ def row_names(
     layout: Layout, q: Coordinates, args: Parameters, rows: dict[str, slice]
 ) -> list[str]:
     """The name of each row of the constraints, in the order of the multipliers."""
-    inside = jax.eval_shape(lambda q: constraint(layout, q, args), q).size
+    inside = 0
+    if layout.has_constraints:
+        inside = jax.eval_shape(lambda q: constraint(layout, q, args), q).size
+    inside += layout.num_internal
     outside = jax.eval_shape(lambda q: redundancy(layout, q, args), q).size
     last = max([inside, *(place.stop for place in rows.values())])
     names = [str(k) for k in range(last + outside)]
@@ -89,6 +89,7 @@ def first_dependent(
     gradients = []
     if layout.has_constraints:
         gradients += [*jax.jacfwd(lambda x: constraint(layout, x, args))(q)]
+    gradients += [*jax.jacfwd(lambda x: internal(layout, x))(q)]
     if layout.drives:
         gradients += [*jax.jacfwd(lambda x: driven(layout, x, start, args))(q)]
     of_parts = {k for place in places.values() for k in range(place.start, place.stop)}

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._system import System
+from .._system import RigidBodies, System
 from .._types import Coordinates, Multipliers, Scalar, Velocities
 from ._feedback import Moving
 from ._laws import AbstractForceLaw, Acting, Driven
@@ -31,6 +31,7 @@ def make_system(layout: Layout, over_constrained: bool) -> System:
         force=eqx.Partial(force, layout) if layout.has_pushes else None,
         driven=eqx.Partial(driven, layout) if layout.drives else None,
         redundant=over_constrained,
+        rigid_bodies=layout.rigid_bodies,
     )
 
 
@@ -73,12 +74,13 @@ def constraint(layout: Layout, q: Coordinates, args: Parameters) -> Multipliers:
         for group, numbers in zip(layout.joint_groups, args.tables["joints"], strict=True)
     ]
     parts += [vector_of(name, fn, view, args) for name, fn in layout.constraints]
-    parts += [
-        jax.vmap(group.kind.internal)(rows(q, group.q)).reshape(-1)
-        for group in layout.body_groups
-        if group.kind.num_internal
-    ]
     return jnp.concatenate(parts)
+
+
+def internal(layout: Layout, q: Coordinates) -> Multipliers:
+    """The constraints between directors, which `System` adds after those of the scene."""
+    table = layout.rigid_bodies
+    return q[:0] if table is None else RigidBodies(table, q.size).internal(q)
 
 
 def driven(layout: Layout, q: Coordinates, t: Scalar, args: Parameters) -> Multipliers:

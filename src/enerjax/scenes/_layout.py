@@ -97,8 +97,18 @@ class Layout:
 
     @property
     def has_constraints(self) -> bool:
-        internal = any(group.kind.num_internal for group in self.body_groups)
-        return bool(self.joints or self.constraints or internal)
+        return bool(self.joints or self.constraints)
+
+    @property
+    def rigid_bodies(self) -> np.ndarray | None:
+        """The coordinates of the bodies with directors; `None` if there are none."""
+        groups = [group.q for group in self.body_groups if group.kind.num_internal]
+        return np.concatenate(groups) if groups else None
+
+    @property
+    def num_internal(self) -> int:
+        """The number of constraints between directors."""
+        return sum(kind.num_internal for _, kind in self.bodies)
 
     @property
     def has_pushes(self) -> bool:

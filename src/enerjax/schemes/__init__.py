@@ -16,6 +16,7 @@ from .base import (
     AbstractScheme as AbstractScheme,
     AbstractSchemeWithChord as AbstractSchemeWithChord,
     AbstractSchemeWithMemory as AbstractSchemeWithMemory,
+    AbstractSchemeWithRotations as AbstractSchemeWithRotations,
     Energies as Energies,
     ForceLaw as ForceLaw,
     Formulation as Formulation,

@@ -4,10 +4,11 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax
+from jaxtyping import Array
 
 from .._operators import Gradient, Increment
 from .._system import State
-from .._types import Coordinates, Multipliers, Scalar, Velocities
+from .._types import Increments, Multipliers, Scalar, Velocities
 from .base import ForceLaw, StepProblem
 
 
@@ -27,8 +28,8 @@ def predict_jump_and_end(
     would be `v0`, and the equation for kappa would be singular there.
     """
     end = problem.guess(acceleration, multipliers)
-    start, lift = problem.start, lambda v: problem.model.lift(problem.start.q, v)
-    _, rate = jax.jvp(lift, (start.v,), (-problem.h / 6 * acceleration,))
+    start, rates = problem.start, lambda v: problem.model.rates(problem.start.q, v)
+    _, rate = jax.jvp(rates, (start.v,), (-problem.h / 6 * acceleration,))
     momentum = start.v[: end.momentum.size]
     parts = lambda z: (z.rate, z.momentum)
     return JumpAndEnd(eqx.tree_at(parts, end, (rate, momentum)), end)
@@ -53,13 +54,11 @@ def jump_gradient(
     `after` is `DH_g`, `before` is `DH_h`, `start` is `grad H(z0)`, `jump` is `grad H(zj)`.
     """
 
-    def combined(g: Coordinates, h: Coordinates, x0: Coordinates, xj: Coordinates):
+    def combined(g: Array, h: Array, x0: Array, xj: Array) -> Array:
         return -(g - h) / 3 + alpha.astype(g.dtype) / 6 * (xj - x0)
 
-    parts = after, before, start, jump
-    return Gradient(
-        combined(*(x.impulse for x in parts)), combined(*(x.rate for x in parts))
-    )
+    no_time = lambda x: Gradient(x.impulse, x.rate, rows=x.rows)
+    return jax.tree.map(combined, *map(no_time, (after, before, start, jump)))
 
 
 class Loads(eqx.Module):
@@ -69,10 +68,10 @@ class Loads(eqx.Module):
     - `start`, `jump`: at the nodes `z0` and `zj`.
     """
 
-    after: Coordinates | None = None
-    before: Coordinates | None = None
-    start: Coordinates | None = None
-    jump: Coordinates | None = None
+    after: Increments | None = None
+    before: Increments | None = None
+    start: Increments | None = None
+    jump: Increments | None = None
 
 
 def jump_loads(
@@ -100,7 +99,7 @@ def _loads(
     problem: StepProblem,
     jump: State,
     end: State,
-) -> tuple[Coordinates, Coordinates, Coordinates, Coordinates]:
+) -> tuple[Increments, Increments, Increments, Increments]:
     """The fields of `Loads` for one force."""
     model, start = problem.model, problem.start
     v0, vj = model.velocity(start), model.velocity(jump)

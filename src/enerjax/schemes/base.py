@@ -21,7 +21,14 @@ from .._operators import (
 )
 from .._results import RESULTS
 from .._system import State
-from .._types import Coordinates, JointMultipliers, Multipliers, Scalar, Velocities
+from .._types import (
+    Coordinates,
+    Increments,
+    JointMultipliers,
+    Multipliers,
+    Scalar,
+    Velocities,
+)
 
 
 # The levels at which joints are imposed: positions and velocities, with the stabilisation
@@ -63,6 +70,9 @@ class StepProblem(eqx.Module):
     - `h`: the length of the step, a scalar (time); negative in a backward stage.
     - `derivative`: the discrete gradient; not used by schemes without one.
     - `formulation`: the levels at which joints are imposed, `"ggl"` or `"index3"`.
+    - `is_one_interval`: whether discrete gradients are those of the whole step, from its
+      start to its end. Only then can the velocity-level multipliers of bodies that are
+      moved by rotations conserve angular momentum.
     """
 
     model: AbstractModel
@@ -70,6 +80,7 @@ class StepProblem(eqx.Module):
     h: Scalar
     derivative: AbstractDerivative = ChainRule()
     formulation: Formulation = eqx.field(default="ggl", static=True)
+    is_one_interval: bool = eqx.field(default=False, static=True)
 
     @classmethod
     def with_constant_inertia(
@@ -119,7 +130,11 @@ class StepProblem(eqx.Module):
 
     def position(self, increment: Increment) -> Coordinates:
         """The coordinates at the node that an increment leads to, shape `(nq,)`."""
-        return self.start.q + self.h * increment.rate
+        return self.start.q + self.displacement(increment)
+
+    def displacement(self, increment: Increment) -> Coordinates:
+        """The change of the coordinates to the node of an increment, shape `(nq,)`."""
+        return self.model.displacement(self.start.q, self.h * increment.rate)
 
     def velocity(self, end: Increment) -> Velocities:
         """`Lm (q1 - q0)/h`: the mean velocity, without the terms of the multipliers."""
@@ -133,18 +148,22 @@ class StepProblem(eqx.Module):
         """The states at the nodes whose increments and times are `ends`.
 
         `velocities(reaction)` must return the velocities at the nodes, solved from the rows
-        `S_mu`, where `reaction(q, t, eta)` is `M^-1 C(q, t)^T eta`. It is not called where
-        the momenta are unknowns.
+        `S_mu`, where `reaction(a, b, eta)` is the mean of `M^-1 C(q, t)^T eta` over the
+        interval between the positions `a = (q, t)` and `b`. It is not called where the
+        momenta are unknowns.
         """
         momenta = tuple(z.momentum for z, _ in ends)
-        found = self.model.node_momenta(momenta, velocities)
+        step = self.h * ends[-1][0].rate if self.is_one_interval else None
+        found = self.model.node_momenta(momenta, velocities, step)
         return tuple(
             State(self.position(z), v, t) for (z, t), v in zip(ends, found, strict=True)
         )
 
     def discrete_gradient(self, a: State, b: State, increment: Increment) -> Gradient:
         """The discrete gradient over `a -> b` with the multipliers of `increment`."""
-        return self.model.discrete_gradient(self.derivative, a, b, self.h, increment)
+        return self.model.discrete_gradient(
+            self.derivative, a, b, self.h, increment, is_step=self.is_one_interval
+        )
 
     def drive_work(self, a: State, b: State, increment: Increment) -> Scalar | None:
         """The work of the driven constraints over `a -> b`; `None` if there are none."""
@@ -154,14 +173,14 @@ class StepProblem(eqx.Module):
 
     def load(
         self, law: ForceLaw, a: State, b: State, end: Increment, velocity: Velocities
-    ) -> Coordinates:
+    ) -> Increments:
         """`h Lm^T f` in the middle of `a -> b`; `Lm` is that of the whole step to `end`."""
         assert a.t is not None
         assert b.t is not None
         force = law(0.5 * (a.q + b.q), velocity, 0.5 * (a.t + b.t))
         return self.h * self.model.pull(self.start.q, self.position(end), force)
 
-    def step_load(self, b: State, end: Increment) -> Coordinates | None:
+    def step_load(self, b: State, end: Increment) -> Increments | None:
         """`h Lm^T f` in the middle of the step; `None` for a system without forces."""
         if self.model.system.force is None:
             return None
@@ -209,7 +228,7 @@ class StepProblem(eqx.Module):
 
     def constraint_matrix(self, end: Increment) -> ConstraintMatrix:
         """`B M^-1 B^T` in the middle of the step to `end`."""
-        middle = self.start.q + 0.5 * self.h * end.rate
+        middle = 0.5 * (self.start.q + self.position(end))
         return self.model.constraint_matrix(middle, self.middle_time)
 
     def rows(self, z: Increment, state: State, gradient: Gradient) -> Increment:
@@ -242,7 +261,7 @@ class StepProblem(eqx.Module):
         num_rates = jax.eval_shape(self.joint_rate, self.start).size
         return Increment(
             impulse=h * multipliers,
-            rate=self.model.lift(q, v + 0.5 * h * acceleration),
+            rate=self.model.rates(q, v + 0.5 * h * acceleration),
             momentum=self.model.momentum_rows(v + h * acceleration),
             velocity_impulse=jnp.zeros((num_rates,), q.dtype),
         )
@@ -375,3 +394,13 @@ class AbstractSchemeWithChord(AbstractOneSolveScheme[Z, P], Generic[Z, P]):
     @abc.abstractmethod
     def chord(self, rows: Z, problem: P, constraints: ConstraintMatrix) -> Z:
         """The unknowns `x` that solve `J x = rows` with the approximate Jacobian `J`."""
+
+
+class AbstractSchemeWithRotations(AbstractSchemeWithChord[Z, P], Generic[Z, P]):
+    """A scheme that moves rigid bodies in space by rotations.
+
+    It obtains positions from `StepProblem.position` and displacements from
+    `StepProblem.displacement`; the velocities of a body are `(xdot, W)`, with the angular
+    velocity `W` in body axes. For other schemes the directors of rigid bodies are
+    coordinates with constraints.
+    """

@@ -195,6 +195,7 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
         total = Gradient(
             impulse=gradient.impulse - h / 12 * skew.impulse + force,
             rate=gradient.rate - h / 12 * skew.rate + rate,
+            rows=gradient.rows,
         )
         return step.rows(z, end, total)
 
@@ -206,14 +207,13 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
         start, dq, q1, t1 = step.start, h * z.rate, step.position(z), step.end_time
 
         def velocity(reaction: Reaction) -> tuple[Velocities]:
-            at_start = reaction(start.q, start.t, z.velocity_impulse)
-            at_end = reaction(q1, t1, z.velocity_impulse)
+            added = reaction((start.q, start.t), (q1, t1), z.velocity_impulse)
             curvature, _ = step.model.stiffness_product(
                 self._middle(z, step, start.v), z.impulse / h, (dq, step.duration)
             )
             force = h / 6 * (curvature - dissipative.matrix @ dq)
             # The row S_mu, solved for v1 - v0. The jump depends on v1 - v0 too.
-            right = 2 * (z.rate - start.v) - (at_start + at_end)
+            right = 2 * (z.rate - start.v - added)
             right = right - dissipative.inverse_inertia @ force
             if jump_v is not None:
                 return (start.v + right - jump_v,)

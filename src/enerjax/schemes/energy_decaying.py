@@ -20,10 +20,10 @@ from ._discontinuous import (
     predict_jump_and_end,
     split_velocities,
 )
-from .base import AbstractSchemeWithChord, Formulation, StepEnd, StepProblem
+from .base import AbstractSchemeWithRotations, Formulation, StepEnd, StepProblem
 
 
-class EnergyDecaying(AbstractSchemeWithChord[JumpAndEnd, StepProblem]):
+class EnergyDecaying(AbstractSchemeWithRotations[JumpAndEnd, StepProblem]):
     """Discontinuous Galerkin scheme, whose energy decays by `alpha` times that of a jump.
 
     The state jumps from `z0` to `zj` at the start of the step and then moves to `z1`:
@@ -127,7 +127,7 @@ class EnergyDecaying(AbstractSchemeWithChord[JumpAndEnd, StepProblem]):
         drive_work = problem.drive_work(jump, end, z.end)
         return StepEnd(
             state=end,
-            displacement=problem.h * z.end.rate,
+            displacement=problem.displacement(z.end),
             multipliers=z.end.impulse / problem.h,
             energies=problem.account(dissipated, work, drive_work),
         )
@@ -139,11 +139,9 @@ class EnergyDecaying(AbstractSchemeWithChord[JumpAndEnd, StepProblem]):
         t0, t1 = start.t, problem.end_time
 
         def velocities(reaction: Reaction) -> tuple[Velocities, Velocities]:
-            mean = lambda qa, ta, qb, tb, eta: (
-                0.5 * (reaction(qa, ta, eta) + reaction(qb, tb, eta))
-            )
-            after = mean(qj, t0, q1, t1, z.end.velocity_impulse)
-            before = mean(start.q, t0, qj, t0, z.jump.velocity_impulse)
+            at_start, at_jump, at_end = (start.q, t0), (qj, t0), (q1, t1)
+            after = reaction(at_jump, at_end, z.end.velocity_impulse)
+            before = reaction(at_start, at_jump, z.jump.velocity_impulse)
             return split_velocities(
                 self.alpha,
                 start.v,

@@ -7,10 +7,10 @@ from .._system import State
 from .._types import Multipliers, Scalar, Velocities
 from ._arguments import check_derivative, check_formulation
 from ._chord import step_chord
-from .base import AbstractSchemeWithChord, Formulation, StepEnd, StepProblem
+from .base import AbstractSchemeWithRotations, Formulation, StepEnd, StepProblem
 
 
-class EnergyPreserving(AbstractSchemeWithChord[Increment, StepProblem]):
+class EnergyPreserving(AbstractSchemeWithRotations[Increment, StepProblem]):
     """Continuous Galerkin scheme, which preserves the total energy.
 
     Solves `S(z0, z1, DH(z0, z1)) = 0` with the constraints at the end of the step.
@@ -50,7 +50,9 @@ class EnergyPreserving(AbstractSchemeWithChord[Increment, StepProblem]):
         return True
 
     def problem(self, model: AbstractModel, start: State, h: Scalar) -> StepProblem:
-        return StepProblem(model, start, h, self.derivative, self.formulation)
+        return StepProblem(
+            model, start, h, self.derivative, self.formulation, is_one_interval=True
+        )
 
     def predict(
         self, problem: StepProblem, acceleration: Velocities, multipliers: Multipliers
@@ -79,7 +81,7 @@ class EnergyPreserving(AbstractSchemeWithChord[Increment, StepProblem]):
         )
         return StepEnd(
             state=end,
-            displacement=problem.h * z.rate,
+            displacement=problem.displacement(z),
             multipliers=z.impulse / problem.h,
             energies=problem.account(jnp.zeros_like(problem.h), work, drive_work),
         )
@@ -88,11 +90,9 @@ class EnergyPreserving(AbstractSchemeWithChord[Increment, StepProblem]):
         start, q1, t1 = problem.start, problem.position(z), problem.end_time
 
         def velocity(reaction: Reaction) -> tuple[Velocities]:
-            at_start = reaction(start.q, start.t, z.velocity_impulse)
-            at_end = reaction(q1, t1, z.velocity_impulse)
+            added = reaction((start.q, start.t), (q1, t1), z.velocity_impulse)
             # eq. (14b), solved for v1
-            mean = problem.velocity(z) - 0.5 * (at_start + at_end)
-            return (2 * mean - start.v,)
+            return (2 * (problem.velocity(z) - added) - start.v,)
 
         (end,) = problem.nodes(velocity, (z, t1))
         return end

@@ -166,8 +166,9 @@ class KappaDecaying(AbstractOneSolveScheme[_Unknowns, StepProblem]):
         t0, t1 = start.t, problem.end_time
 
         def velocities(reaction: Reaction) -> tuple[Velocities, Velocities]:
-            at_jump = reaction(qj, t0, jump.velocity_impulse)
-            at_end = reaction(q1, t1, end.velocity_impulse)
+            node = lambda q, t, eta: reaction((q, t), (q, t), eta)
+            at_jump = node(qj, t0, jump.velocity_impulse)
+            at_end = node(q1, t1, end.velocity_impulse)
             # eq. (66c): vj + v1, and eq. (66d)
             total = 2 * problem.velocity(end) - (at_jump + at_end)
             difference = -(6 * model.push(start.q, qj, jump.rate) + (at_end - at_jump))
@@ -189,4 +190,5 @@ def _position_level(increment: Increment) -> Increment:
 
 def _scaled(kappa: Scalar, gradient: Gradient, reaction: Velocities | float = 0.0):
     """The gradient with the rate `kappa * gradient.rate + reaction`."""
-    return Gradient(gradient.impulse, kappa * gradient.rate + reaction)
+    rate = kappa * gradient.rate + reaction
+    return Gradient(gradient.impulse, rate, rows=gradient.rows)

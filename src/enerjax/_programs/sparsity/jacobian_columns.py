@@ -49,6 +49,17 @@ def jacobian_columns(
     return columns_along(fn, x, np.eye(x.size))
 
 
+def batched_columns(
+    fn: Callable[[Array], Array], x: Float[Array, " n"], seeds: Float[np.ndarray, "n k"]
+) -> Float[Array, "... k"]:
+    """The same derivatives as `columns_along`, with `jax.vmap`.
+
+    They take longer to compute, but their program is compiled several times as fast.
+    """
+    push = lambda seed: jax.jvp(fn, (x,), (seed,))[1]
+    return jax.vmap(push, in_axes=1, out_axes=-1)(jnp.asarray(seeds, x.dtype))
+
+
 class _Columns:
     """An array of the program with one more axis, the last one, along its columns.
 

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from ..._programs import columns_along, in_one_function, shape_of
+from ..._programs import batched_columns, columns_along, in_one_function, shape_of
 from .dense import AbstractFactors
 from .elimination import apply_reduction, eliminate_columns, LAPACK_FROM
 
@@ -39,7 +39,8 @@ class Band:
     - `padding`: ones on the diagonal at padded positions, shape as `places`.
     """
 
-    def __init__(self, pattern: csr_array):
+    def __init__(self, pattern: csr_array, rarely: bool = False):
+        self._rarely = rarely
         size, _ = shape_of(pattern)
         both = (pattern + pattern.T).tocsr()
         order = reverse_cuthill_mckee(both, symmetric_mode=True)
@@ -83,7 +84,7 @@ class Band:
         self, fn: Callable[[Array], Array], x: Float[Array, " n"]
     ) -> Float[Array, "blocks width three_widths"]:
         """The band of the Jacobian of `fn` at `x`."""
-        products = coloured_products(fn, x, self.colours)
+        products = coloured_products(fn, x, self.colours, self._rarely)
         entries = jnp.append(products.ravel(), 0)
         return entries[self.places] + jnp.asarray(self.padding, x.dtype)
 
@@ -118,11 +119,18 @@ def block_sizes(pattern: csr_array) -> np.ndarray:
 
 
 def coloured_products(
-    fn: Callable[[Array], Array], x: Float[Array, " n"], colours: np.ndarray
+    fn: Callable[[Array], Array],
+    x: Float[Array, " n"],
+    colours: np.ndarray,
+    rarely: bool = False,
 ) -> Float[Array, "m ... colours"]:
-    """For each colour, the sum of the columns of the Jacobian that have this colour."""
+    """For each colour, the sum of the columns of the Jacobian that have this colour.
+
+    If they are needed `rarely`, a program is chosen that compiles quickly.
+    """
     numbers = np.arange(int(colours.max(initial=0)) + 1)
-    return columns_along(fn, x, colours[:, None] == numbers)
+    columns = batched_columns if rarely else columns_along
+    return columns(fn, x, colours[:, None] == numbers)
 
 
 def column_colours(pattern: csr_array, order: np.ndarray) -> np.ndarray:

@@ -104,10 +104,19 @@ def blocks_of(matrix: Symmetric) -> Float[Array, "blocks size size"]:
     return matrix.blocks if isinstance(matrix, BlockDiagonal) else matrix[None]
 
 
-def hessian(fn: Callable[[Array], Array], at: Float[Array, " n"]) -> Symmetric:
-    """The Hessian of a scalar function; block-diagonal if it is large and has that form."""
+def hessian(
+    fn: Callable[[Array], Array],
+    at: Float[Array, " n"],
+    together: np.ndarray | None = None,
+) -> Symmetric:
+    """The Hessian of a scalar function; block-diagonal if it is large and has that form.
+
+    Rows with the same number in `together` are in one block.
+    """
     gradient = jax.grad(fn)
     pattern = jacobian_pattern(gradient, at) if at.size > _FEW else None
+    if pattern is not None and together is not None:
+        pattern = csr_array(pattern.toarray() | (together[:, None] == together[None]))
     places = None if pattern is None else _places(pattern)
     if places is None:
         return jax.jacfwd(gradient)(at)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, PyTree
 from scipy.sparse import csr_array
 
 from ..._programs import (
+    batched_columns,
     in_one_function,
     jacobian_columns,
     jacobian_pattern,
@@ -31,9 +32,12 @@ class Dense:
     """
 
     def __init__(
-        self, solver: lx.AbstractLinearSolver | None, pattern: csr_array | None = None
+        self,
+        solver: lx.AbstractLinearSolver | None,
+        pattern: csr_array | None = None,
+        rarely: bool = False,
     ):
-        self.solver = solver
+        self.solver, self._rarely = solver, rarely
         self._colours = None
         if pattern is None:
             return
@@ -42,8 +46,13 @@ class Dense:
 
     def evaluate(self, fn: Callable[[Array], Array], x: Float[Array, " n"]) -> Array:
         if self._colours is None:
-            return jacobian_columns(fn, x)
-        columns = coloured_products(fn, x, self._colours)[:, self._colours]
+            return (
+                batched_columns(fn, x, np.eye(x.size))
+                if self._rarely
+                else (jacobian_columns(fn, x))
+            )
+        products = coloured_products(fn, x, self._colours, self._rarely)
+        columns = products[:, self._colours]
         return jnp.where(self._nonzero, columns, 0)
 
     def empty(self, size: int, dtype: Any) -> AbstractFactors:
@@ -159,11 +168,14 @@ def linearisable(
     args: Any,
     linear_solver: lx.AbstractLinearSolver | AbstractSparseSolver | None = None,
     regularisation: Float[Array, " n"] | None = None,
+    *,
+    rarely: bool = False,
 ) -> Linearisable:
     """`fn(x, args)` as a function of `x`. All traced values must be passed in `args`.
 
     By default the size and the sparsity of the Jacobian determine the linear solver. The
-    `regularisation` is added to the diagonal of a Jacobian that may be singular.
+    `regularisation` is added to the diagonal of a Jacobian that may be singular. If the
+    Jacobian is needed `rarely`, its program is one that compiles quickly.
     """
     value = plain_products(fn, like, args)
     if isinstance(linear_solver, lx.AbstractLinearSolver):
@@ -177,9 +189,9 @@ def linearisable(
         return Linearisable(value, form, regularisation)
     pattern = jacobian_pattern(regularised, like) if like.size > LARGE else None
     if pattern is None:
-        return Linearisable(value, Dense(None), regularisation)
-    band = Band(pattern)
-    form = band if band.is_cheaper_than_dense() else Dense(None, pattern)
+        return Linearisable(value, Dense(None, rarely=rarely), regularisation)
+    band = Band(pattern, rarely)
+    form = band if band.is_cheaper_than_dense() else Dense(None, pattern, rarely)
     return Linearisable(value, form, regularisation)
 
 
