@@ -96,6 +96,18 @@ def test_a_joint_leaves_its_degrees_of_freedom_and_carries_all_other_loads(name)
     np.testing.assert_allclose(found.torque, 0, rtol=0, atol=1e-12)
 
 
+def test_a_clamp_carries_the_weight_and_its_moment_about_the_clamp():
+    parts = [
+        ej.bodies.PlanarBody.rod("arm", 2.0, [1.0, 0.0], [1.6, 0.0]),
+        ej.joints.Fixed("clamp", "ground", "arm", [1.0, 0.0]),
+    ]
+    scene = ej.Scene(parts, gravity=[0.0, -9.81])
+    rest = ej.consistent_start(scene.system, scene.q, scene.v, scene.args)
+    found = scene.reaction(rest, "clamp")
+    np.testing.assert_allclose(found.force, [0.0, 2 * 9.81], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found.torque, [2 * 9.81 * 0.3], rtol=0, atol=1e-12)
+
+
 @functools.cache
 def flight(kind, name):
     """Two bodies, turned anyhow, that fly and tumble freely."""

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import enerjax as ej
+from enerjax._operators import make_model
 
 from .helpers import march, SCHEMES, slopes
 from .references import (
@@ -159,6 +160,17 @@ def test_schemes_state_their_order():
     }
     assert {name: SCHEMES[name](0.0).order for name in expected} == expected
     assert ej.EnergyConsistent(0.5).order == 3
+
+
+def test_the_dissipative_stiffness_is_that_of_half_a_step_of_free_flight():
+    """Of stiffening springs, 3 k q^2; in between no eigenvalue is negative."""
+    k, h = jnp.array([2.0, 5.0]), jnp.asarray(0.3)
+    system = ej.System(jnp.eye(2), lambda q, args: 0.25 * k @ q**4)
+    start = ej.State([1.0, -0.4], [0.7, 2.0])
+    step = ej.EnergyConsistent(0.5).problem(make_model(system, start, None), start, h)
+    middle = np.array([1.0 + 0.15 * 0.7, -0.4 + 0.15 * 2.0])
+    expected = np.diag(3 * np.asarray(k) * middle**2)
+    np.testing.assert_allclose(step.dissipative.matrix, expected, rtol=0, atol=1e-13)
 
 
 def test_transformations_keep_the_order():

@@ -29,6 +29,13 @@ def test_energies_of_the_starts_are_the_published_ones(name):
     )
 
 
+def test_the_weight_of_the_elastic_pendulum_points_downwards():
+    """Its spring is relaxed at the start."""
+    system, start, args = problem("elastic")
+    force = -jax.grad(system.potential)(start.q, args)
+    np.testing.assert_allclose(force, [0.0, 0.0, -9.81], rtol=0, atol=1e-13)
+
+
 def top(h, scheme="preserving"):
     return solve("top", scheme, h=h, steps=1000)
 
