@@ -134,7 +134,11 @@ def test_free_rigid_body_keeps_its_momentum_to_second_order():
 
 
 @pytest.mark.parametrize(
-    ("scheme", "order", "bound"), [("preserving", 2, 1e-4), ("consistent", 4, 1e-7)]
+    ("scheme", "order", "bound"),
+    [
+        ("preserving", 2, 1e-4),
+        pytest.param("consistent", 4, 1e-7, marks=pytest.mark.slow),
+    ],
 )
 def test_four_particles_converge_to_the_published_motion(scheme, order, bound):
     q, v = FOUR_PARTICLES[1.0]
@@ -154,7 +158,7 @@ CAR_AXIS_RUNS = {
 }
 
 
-@pytest.mark.parametrize("case", long(CAR_AXIS_RUNS, "consistent", "consistent, composed"))
+@pytest.mark.parametrize("case", long(CAR_AXIS_RUNS, *list(CAR_AXIS_RUNS)[1:]))
 def test_the_car_axis_meets_the_published_values(case):
     """Driven; truncation, bounded by what was measured at these steps."""
     scheme, steps, position, velocity = CAR_AXIS_RUNS[case]
