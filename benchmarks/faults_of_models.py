@@ -120,7 +120,7 @@ FAULTS = (
         'law, start = Elastic(PlanarTurn(), "angle"), ends.relative_angle()',
         'law, start = Elastic(PlanarTurn(), "angle"), 0.0 * ends.relative_angle()',
         "A torsion spring in the plane is relaxed at angle zero and not at the start.",
-        of("scenes::test_forces_have_the_stated_energies"),
+        of("scenes::test_a_torsion_spring_in_the_plane_is_relaxed_at_the_start"),
     ),
     Fault(
         "drives: half a turn is not missed",
@@ -144,7 +144,7 @@ FAULTS = (
         "    mean = 0.5 * (found.rate[..., 1:] + found.rate[..., :-1])\n",
         "    mean = found.rate[..., :-1]\n",
         "Turns between rows are counted with the rate at the row before.",
-        of("scene_servos::test_a_hinge_in_space_counts_its_turns"),
+        of("scene_servos::test_turns_between_rows_are_counted_with_the_mean_rate"),
     ),
     Fault(
         "reactions: torque about the mass centre",
@@ -152,9 +152,7 @@ FAULTS = (
         "    pivot = pivot_of(b, numbers)\n",
         "    pivot = b.origin\n",
         "The torque of a joint is that about the mass centre of its second body.",
-        of(
-            "joints::test_a_joint_leaves_its_degrees_of_freedom_and_carries_all_other_loads"
-        ),
+        of("joints::test_a_clamp_carries_the_weight_and_its_moment_about_the_clamp"),
     ),
     Fault(
         "gaps: an arc in another unit",
@@ -162,7 +160,7 @@ FAULTS = (
         "turn / size",
         "turn * size",
         "A gap in an angle is measured in the wrong unit.",
-        of("scenes::test_a_small_gap_is_reported_and_closed"),
+        of("scenes::test_a_gap_in_an_angle_is_the_length_of_its_arc"),
     ),
     # Problems ---------------------------------------------------------------------------
     Fault(
@@ -171,7 +169,7 @@ FAULTS = (
         'args["m"] * args["g"] * q[2]',
         '-args["m"] * args["g"] * q[2]',
         "Gravity pulls the elastic pendulum upwards; all that it conserves stays.",
-        of("problems::test_energies_of_the_starts_are_the_published_ones"),
+        of("problems::test_the_weight_of_the_elastic_pendulum_points_downwards"),
     ),
     # Tools ------------------------------------------------------------------------------
     Fault(
@@ -215,6 +213,6 @@ FAULTS = (
         "(_FINER[1] / _FINER[0]) ** order - 1",
         "(_FINER[1] / _FINER[0]) ** order",
         "Richardson's extrapolation stops short.",
-        of("measure::test_the_extrapolated_reference_is_as_good_as_exact_data"),
+        of("measure::test_the_extrapolation_of_two_runs_removes_their_leading_error"),
     ),
 )

@@ -135,8 +135,9 @@ FAULTS = (
         "_operators/scaling.py",
         "scales.constraint_size / jnp.abs(h)",
         "scales.constraint_size / h",
-        "In backward stages of a composition constraints have a negative size.",
-        of("step::test_a_composition_is_its_stages_one_after_the_other"),
+        "In backward stages of a composition constraints have a negative size: in steps of "
+        "about a length their scale vanishes.",
+        of("step::test_a_backward_stage_is_scaled_like_a_forward_one"),
     ),
     Fault(
         "phase: the constant of the fourth order",
@@ -217,8 +218,9 @@ FAULTS = (
         "schemes/_dissipative_stiffness.py",
         "    half_way = start.q + 0.5 * h * model.lift(start.q, start.v)\n",
         "    half_way = start.q\n",
-        "The dissipative stiffness is that of the start: the order of the decay is lower.",
-        of("orders::test_errors_shrink_with_the_order_of_the_scheme"),
+        "The dissipative stiffness is that of the start: springs that stiffen lose "
+        "too little.",
+        of("orders::test_the_dissipative_stiffness_is_that_of_half_a_step_of_free_flight"),
     ),
     Fault(
         "consistent: derivative of an indefinite stiffness",

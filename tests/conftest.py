@@ -17,6 +17,8 @@ if (0, 7, 2) <= jaxlib.version.__version_info__ < (0, 11):
         os.environ["XLA_FLAGS"] = f"{LESS} {os.environ.get('XLA_FLAGS', '')}".strip()
 
 jax.config.update("jax_enable_x64", True)
+# Programs need not tell which lines they come from; errors of Python do all the same.
+jax.config.update("jax_traceback_in_locations_limit", 0)
 # Broadcasts between ranks and mixtures of dtypes in the package are oversights.
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")

@@ -1,6 +1,7 @@
 """Adaptive steps: their errors, their energy, their derivatives."""
 
 import functools
+from types import SimpleNamespace
 from typing import Any
 
 import equinox as eqx
@@ -13,6 +14,7 @@ import enerjax as ej
 from enerjax._operators import make_model
 from enerjax._run.collocation import rates
 from enerjax._run.controller import other_end
+from enerjax._run.step_sizes import End
 
 from .helpers import problem
 from .references import double_pendulum_reference
@@ -72,6 +74,27 @@ def test_the_estimate_tends_to_the_error_of_a_step(name):
     # Truncation: the next order in h.
     assert distances[0] < 0.2
     assert distances[1] < 0.6 * distances[0]
+
+
+@pytest.mark.parametrize(("size", "is_accepted"), [(0.99, True), (1.01, False)])
+def test_a_step_is_accepted_by_the_root_mean_square_of_its_error(size, is_accepted):
+    """Points in free flight that end a little off: by hand, for coordinates at rest in
+    their velocities, which are half of the entries."""
+    rtol, atol, h = 1e-3, 1e-4, jnp.asarray(0.5)
+    system = ej.System(jnp.eye(3), lambda q, args: 0.0 * q[0])
+    start = ej.State([1.0, 2.0, 0.0], [1.0, -0.5, 0.1])
+    plan = ej.StepController(rtol, atol).plan(
+        ej.EnergyPreserving(), h, jnp.asarray(0.0), End(t1=jnp.asarray(1.0))
+    )
+    there = start.q + h * start.v
+    part = jnp.array([1.0, -2.0, 0.5]) * size * np.sqrt(6 / 5.25)
+    # Of the larger of both ends, to first order in the tolerance.
+    bound = atol + rtol * jnp.maximum(jnp.abs(start.q), jnp.abs(there))
+    end = ej.State(there + part * bound, start.v)
+    model = make_model(system, start, None)
+    out = SimpleNamespace(state=end, result=ej.RESULTS.successful)
+    verdict = plan.judge(plan.begin(model, start), model, start, out, h)  # pyright: ignore
+    assert bool(verdict.accepted) == is_accepted
 
 
 # Structure ------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import pytest
 
 import enerjax as ej
 
-from .helpers import EPS, failed, on_host, problem, SCHEMES, solve, TURNOVER
+from .helpers import EPS, failed, long, on_host, problem, SCHEMES, solve, TURNOVER
 
 
 # Solver: Newton leaves a few eps of the energy in each step.
@@ -36,7 +36,14 @@ CASES = [
 STEP = {"spring": 0.02, "particles": 0.01, "body": 0.002}
 
 
-@pytest.mark.parametrize(("name", "scheme", "alpha"), CASES)
+# The same is seen of the spring.
+LONG = [("particles", "consistent", 0.0)]
+
+
+@pytest.mark.parametrize(
+    ("name", "scheme", "alpha"),
+    [pytest.param(*x, marks=pytest.mark.slow if x in LONG else []) for x in CASES],
+)
 def test_the_energy_identity_holds(name, scheme, alpha):
     solution = solve(name, scheme, alpha, h=STEP[name], steps=200)
     assert not failed(solution)
@@ -58,17 +65,17 @@ def test_energy_consistent_never_gains_energy_in_many_dimensions(name):
     assert np.max(np.diff(audit.energy)) <= 20 * EPS * TURNOVER[name]
 
 
-def test_momenta_of_the_free_particles_are_kept_to_second_order():
+@pytest.mark.parametrize("scheme", long(["preserving", "consistent"], "consistent"))
+def test_momenta_of_the_free_particles_are_kept_to_second_order(scheme):
     """The correction of a discrete gradient points along the increment: no symmetry of
     the potential survives it, but what it breaks is small."""
     m = np.asarray(problem("particles").args["m"])[None, :, None]
-    for scheme in ("preserving", "consistent"):
-        ys = solve("particles", scheme, 0.0, h=0.01, steps=200).ys
-        x, v = ys.q.reshape(-1, 4, 3), ys.v.reshape(-1, 4, 3)
-        linear, angular = np.sum(m * v, axis=1), np.sum(m * np.cross(x, v), axis=1)
-        # Truncation: C h^2 with C of order one.
-        np.testing.assert_allclose(linear, np.array([[0, 0, 2]] * 201), rtol=0, atol=1e-4)
-        np.testing.assert_allclose(angular, np.array([[2, -2, 0]] * 201), rtol=0, atol=1e-4)
+    ys = solve("particles", scheme, 0.0, h=0.01, steps=200).ys
+    x, v = ys.q.reshape(-1, 4, 3), ys.v.reshape(-1, 4, 3)
+    linear, angular = np.sum(m * v, axis=1), np.sum(m * np.cross(x, v), axis=1)
+    # Truncation: C h^2 with C of order one.
+    np.testing.assert_allclose(linear, np.array([[0, 0, 2]] * 201), rtol=0, atol=1e-4)
+    np.testing.assert_allclose(angular, np.array([[2, -2, 0]] * 201), rtol=0, atol=1e-4)
 
 
 def _well(q, args):

@@ -210,12 +210,14 @@ def test_multipliers_of_rattle_are_those_of_the_middle_of_the_step():
     system, start, args = problem("pendulum")
     errors = []
     for steps in (50, 100):
-        sol = ej.simulate(system, ej.Rattle(), start, args, h=1 / steps, num_steps=steps)
+        # One program: longer steps go on for longer.
+        sol = ej.simulate(system, ej.Rattle(), start, args, h=1 / steps, num_steps=100)
         accelerations = jax.vmap(
             lambda q, v: ej.consistent_start(system, q, v, args).multipliers
         )(sol.ys.q, sol.ys.v)
         middle = 0.5 * (accelerations[1:] + accelerations[:-1])
-        errors.append(np.max(np.abs(sol.multipliers[1:] - middle)))
+        off = np.abs(sol.multipliers[1:] - middle)
+        errors.append(np.max(off[:steps]))
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.2)  # truncation, of order 2
 
 

@@ -14,7 +14,7 @@ from enerjax._operators import SeparableModel
 from enerjax._solvers import Chord, find_root, Newton, schur, schur_tables
 from enerjax._solvers.linear.blocks import in_blocks
 
-from .helpers import EPS, long, SCHEMES
+from .helpers import EPS, SCHEMES
 
 
 SIZE = 30
@@ -168,9 +168,8 @@ def test_slow_corrections_are_not_taken_for_round_off(off):
     assert jnp.max(jnp.abs(rest)) <= 100 * EPS  # round-off
 
 
-@pytest.mark.parametrize(
-    "name", long(["preserving", "decaying", "consistent"], "preserving", "consistent")
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["preserving", "decaying", "consistent"])
 def test_the_motion_is_that_of_newton_alone(name):
     """A given linear solver is used by Newton's method, without a chord iteration."""
     system, start, args = ej.problems.chain(5)

@@ -20,7 +20,7 @@ from .driven_pendulum import (
     potential,
     SCHEMES,
 )
-from .helpers import follow, slopes
+from .helpers import follow, long, slopes
 
 
 T0, T1 = 0.2, 2.2
@@ -39,7 +39,9 @@ def driven_reference():
     return np.array([np.sin(angle) + r * np.sin(w * T1), np.cos(angle)])
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize(
+    "scheme", long(SCHEMES, "preserving gonzalez", "consistent damped")
+)
 def test_a_pendulum_on_a_moving_pivot(scheme):
     method, order = SCHEMES[scheme]
     start = driven_start()
@@ -110,6 +112,7 @@ def test_the_energy_balance_includes_the_work_of_the_drive():
     assert np.all(audit.work == 0)
 
 
+@pytest.mark.slow
 def test_rows_further_apart_sum_the_work():
     run, thin = driven_run(), driven_run(every=5)
     sums = run.audit.drive_work[1:].reshape(-1, 5).sum(axis=1)

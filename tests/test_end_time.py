@@ -75,8 +75,9 @@ def test_steps_of_different_lengths_end_at_the_same_time():
 
 
 def test_a_decimal_step_length_takes_no_additional_step():
-    # 0.3/0.1 is less than 3, 0.7/0.1 more than 7 - eps.
-    for t1, count in ((0.3, 3), (0.7, 7), (0.72, 8)):
+    # 0.3/0.1 is less than 3, (3 * 0.1)/0.1 is more.
+    assert 3 * 0.1 / 0.1 > 3
+    for t1, count in ((0.3, 3), (3 * 0.1, 3), (0.7, 7), (0.72, 8)):
         every = ej.SaveAt(every=1)
         run = functools.partial(
             until, "pendulum", ej.EnergyPreserving(), 0.1, t1, saveat=every

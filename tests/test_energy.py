@@ -62,9 +62,17 @@ EVERY_RUN = [
     for name, scheme in PRESERVING
     for alpha in ((0.0,) if "preserving" in scheme or "composed" in scheme else ALPHAS)
 ]
+# What the pendulum shows too.
+LONG = [("double", "preserving index3"), ("double", "composed 4")]
 
 
-@pytest.mark.parametrize(("name", "scheme"), PRESERVING)
+def long(cases):
+    """The cases, some of them marked `slow`."""
+    mark = [pytest.mark.slow]
+    return [pytest.param(*x, marks=mark if x[:2] in LONG else []) for x in cases]
+
+
+@pytest.mark.parametrize(("name", "scheme"), long(PRESERVING))
 def test_at_alpha_zero_the_energy_is_constant(name, scheme):
     solution = run(name, scheme)
     assert not failed(solution)
@@ -72,7 +80,7 @@ def test_at_alpha_zero_the_energy_is_constant(name, scheme):
     assert np.max(error) <= SOLVER_ENERGY * TURNOVER[name]
 
 
-@pytest.mark.parametrize(("name", "scheme", "alpha"), EVERY_RUN)
+@pytest.mark.parametrize(("name", "scheme", "alpha"), long(EVERY_RUN))
 def test_every_step_changes_the_energy_by_what_it_reports_as_dissipated(
     name, scheme, alpha
 ):
@@ -82,7 +90,7 @@ def test_every_step_changes_the_energy_by_what_it_reports_as_dissipated(
     assert audit.dissipated[0] == 0
 
 
-@pytest.mark.parametrize(("name", "scheme", "alpha"), EVERY_RUN)
+@pytest.mark.parametrize(("name", "scheme", "alpha"), long(EVERY_RUN))
 def test_constraints_hold_at_the_promised_levels(name, scheme, alpha):
     audit = run(name, scheme, alpha).audit
     assert np.max(np.abs(audit.constraint), initial=0) <= SOLVER_POSITION
@@ -94,7 +102,7 @@ def test_constraints_hold_at_the_promised_levels(name, scheme, alpha):
         assert rate > 1e-3
 
 
-@pytest.mark.parametrize(("name", "scheme", "alpha"), EVERY_RUN)
+@pytest.mark.parametrize(("name", "scheme", "alpha"), long(EVERY_RUN))
 def test_kinetic_and_potential_energy_are_those_of_the_states(name, scheme, alpha):
     solution = run(name, scheme, alpha)
     q, v = solution.ys.q, solution.ys.v

@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 import enerjax as ej
 
-from .helpers import EPS, follow, slopes
+from .helpers import EPS, follow, long, slopes
 
 
 SCHEMES = {
@@ -118,17 +118,27 @@ def _pushed_and_braked(q, v, t, args):
     return args["push"] - args["c"] * v - args["dry"] * dry
 
 
-@pytest.mark.parametrize("smooth", [True, False])
-@pytest.mark.parametrize(
-    "scheme",
-    [
-        ej.EnergyPreserving(),
-        ej.EnergyDecaying(0.5),
-        ej.EnergyConsistent(0.5),
-        ej.Rattle(),
-    ],
-    ids=lambda scheme: type(scheme).__name__,
-)
+# Whether the force is smooth is nothing that a scheme knows of: one of them for both.
+BRAKED = [
+    pytest.param(
+        scheme,
+        smooth,
+        id=f"{type(scheme).__name__}-{smooth}",
+        marks=pytest.mark.slow if smooth and number > 0 else [],
+    )
+    for number, scheme in enumerate(
+        [
+            ej.EnergyPreserving(),
+            ej.EnergyDecaying(0.5),
+            ej.EnergyConsistent(0.5),
+            ej.Rattle(),
+        ]
+    )
+    for smooth in (True, False)
+]
+
+
+@pytest.mark.parametrize(("scheme", "smooth"), BRAKED)
 def test_the_energy_that_dampers_remove_is_reported_separately(scheme, smooth):
     system = ej.System(DAMPED.kinetic, DAMPED.potential, force=_pushed_and_braked)
     args = dict(k=4.0, c=0.8, dry=0.1, push=0.7, smooth=smooth)
@@ -232,7 +242,7 @@ def body_reference(t0, t1):
     return exact(rates, [1.0, 0, 0, 0, 1.0, 2.0, 2.0], t0, t1)[:4]
 
 
-@pytest.mark.parametrize("scheme", ["preserving", "decaying", "kappa"])
+@pytest.mark.parametrize("scheme", long(["preserving", "decaying", "kappa"], "kappa"))
 def test_a_torque_acts_in_body_axes(scheme):
     start = ej.State([1.0, 0, 0, 0], [1.0, 2.0, 2.0])
     truth = body_reference(0.3, 1.3)

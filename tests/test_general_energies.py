@@ -18,8 +18,8 @@ SAME = [
     ("double", ej.EnergyPreserving()),
     ("pendulum", ej.EnergyDecaying(0.5)),
     ("pendulum", ej.EnergyConsistent(0.5)),
-    ("pendulum", ej.KappaDecaying(0.5)),
-    ("pendulum", ej.EnergyPreserving("index3")),
+    pytest.param("pendulum", ej.KappaDecaying(0.5), marks=pytest.mark.slow),
+    pytest.param("pendulum", ej.EnergyPreserving("index3"), marks=pytest.mark.slow),
 ]
 
 
@@ -43,7 +43,11 @@ def test_constant_inertia_gives_the_motion_of_a_system(name, scheme):
     np.testing.assert_allclose(other.audit.kinetic, one.audit.kinetic, atol=1e-12)
 
 
-ORDERS = [("preserving", 2), ("composed 4", 4), ("composed 6", 6), ("consistent", 4)]
+ORDERS = [
+    ("preserving", 2),
+    *[pytest.param(f"composed {order}", order, marks=pytest.mark.slow) for order in (4, 6)],
+    ("consistent", 4),
+]
 
 
 @pytest.mark.parametrize(("scheme", "order"), ORDERS)

@@ -253,9 +253,11 @@ def test_derivatives_of_a_free_oscillator():
 
 
 def test_derivatives_where_the_stiffness_has_eigenvalues_of_both_signs():
-    """The dissipative stiffness is the positive part of one; differences."""
+    """The dissipative stiffness is the positive part of one, in the metric of the inertia;
+    differences."""
     system = ej.System(
-        jnp.eye(2), lambda q, k: 0.5 * k[0] * q[0] ** 2 - k[1] * q[0] * q[1] - q[1] ** 2
+        lambda v, k: 0.5 * k[2:] @ v**2,
+        lambda q, k: 0.5 * k[0] * q[0] ** 2 - k[1] * q[0] * q[1] - q[1] ** 2,
     )
     start = ej.State([1.0, 0.2], [0.0, 0.3])
 
@@ -265,7 +267,9 @@ def test_derivatives_where_the_stiffness_has_eigenvalues_of_both_signs():
         sol = ej.simulate(system, scheme, start, k, h=0.1, num_steps=10, throw=False)
         return jnp.sum(sol.ys.q[-1] * jnp.array([1.0, 0.7]))
 
-    k, along, small = jnp.array([9.0, 2.0]), jnp.array([0.6, -0.8]), 1e-4
-    difference = (end(k + small * along) - end(k - small * along)) / (2 * small)
-    # Truncation of the difference, 1e-8, and its round-off, 1e-12.
-    assert jax.grad(end)(k) @ along == pytest.approx(float(difference), rel=1e-6)
+    k, small = jnp.array([9.0, 2.0, 1.0, 1.5]), 1e-4
+    gradient = jax.grad(end)(k)
+    for along in jnp.array([[0.6, -0.8, 0.0, 0.0], [0.0, 0.0, 0.6, -0.8]]):
+        difference = (end(k + small * along) - end(k - small * along)) / (2 * small)
+        # Truncation of the difference, 1e-8, and its round-off, 1e-12.
+        assert gradient @ along == pytest.approx(float(difference), rel=1e-6)

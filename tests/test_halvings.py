@@ -73,10 +73,16 @@ def test_a_step_that_is_halved_once_equals_two_steps():
     assert solution.stats.halvings[halved] == 1
     start = ej.State(solution.ys.q[halved], solution.ys.v[halved])
     system, _, args = problem("double")
+    multipliers = []
     for _ in range(2):
-        start = ej.step(system, ej.EnergyPreserving(), start, args, h=0.25).state
+        out = ej.step(system, ej.EnergyPreserving(), start, args, h=0.25)
+        start = out.state
+        multipliers.append(out.multipliers)
     # Solver: Newton begins elsewhere.
     np.testing.assert_allclose(solution.ys.q[halved + 1], start.q, rtol=0, atol=1e-11)
+    # The mean force.
+    mean = (multipliers[0] + multipliers[1]) / 2
+    np.testing.assert_allclose(solution.multipliers[halved + 1], mean, rtol=0, atol=1e-9)
 
 
 @pytest.mark.slow

@@ -97,8 +97,19 @@ def test_a_joint_leaves_its_degrees_of_freedom_and_carries_all_other_loads(name)
     np.testing.assert_allclose(found.torque, 0, rtol=0, atol=1e-12)
 
 
-@functools.cache
-def flight(kind, name):
+def test_a_clamp_carries_the_weight_and_its_moment_about_the_clamp():
+    parts = [
+        ej.bodies.PlanarBody.rod("arm", 2.0, [1.0, 0.0], [1.6, 0.0]),
+        ej.joints.Fixed("clamp", "ground", "arm", [1.0, 0.0]),
+    ]
+    scene = ej.Scene(parts, gravity=[0.0, -9.81])
+    rest = ej.consistent_start(scene.system, scene.q, scene.v, scene.args)
+    found = scene.reaction(rest, "clamp")
+    np.testing.assert_allclose(found.force, [0.0, 2 * 9.81], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found.torque, [2 * 9.81 * 0.3], rtol=0, atol=1e-12)
+
+
+def two_bodies(kind, name):
     """Two bodies, turned anyhow, that fly and tumble freely."""
     cls, turn = BODIES[kind], np.array([0.8, -0.4, 0.1, np.sqrt(1 - 0.81)])
     first, at = np.array([0.1, 0.2, -0.1]), np.array([0.3, 0.1, 0.2])
@@ -121,7 +132,12 @@ def flight(kind, name):
         ),
         JOINTS[name][0]("joint", "a", "b", at),
     ]  # fmt: skip
-    scene = ej.Scene(parts)
+    return ej.Scene(parts)
+
+
+@functools.cache
+def flight(kind, name):
+    scene = two_bodies(kind, name)
     system, args = scene.system, scene.args
     # The nearest motion that the joint admits: theirs do not fit.
     start = ej.initial_state(system, scene.q, scene.v, args)
@@ -158,14 +174,30 @@ def drift(x):
     return np.max(np.abs(x - x[0])) / np.max(np.abs(x[0]))
 
 
-# One in the short run; the others are of the same parts.
-SHORT = ("revolute",)
-FLIGHTS = [
-    pytest.param(name, marks=() if name in SHORT else pytest.mark.slow) for name in JOINTS
-]
+@pytest.mark.parametrize("name", JOINTS)
+def test_a_joint_of_two_bodies_admits_their_motion_as_one(name):
+    """Its forces are in balance: they give the two neither momentum nor spin."""
+    scene = two_bodies("directors", name)
+    centre = scene.position(ej.State(scene.q, scene.v), "b")
+    shift, spin = np.array([0.3, -0.7, 0.5]), np.array([0.4, 1.1, -0.6])
+    velocity = np.concatenate(
+        [
+            np.concatenate([shift + np.cross(spin, at), np.cross(spin, axes).ravel()])
+            for at, axes in (
+                (scene.q[:3], np.reshape(scene.q[3:12], (3, 3))),
+                (centre, np.reshape(scene.q[15:], (3, 3))),
+            )
+        ]
+    )
+    constraint = scene.system.constraint
+    assert constraint is not None
+    rows = lambda q: constraint(q, scene.args)
+    rate = jax.jit(lambda q, v: jax.jvp(rows, (q,), (v,))[1])(scene.q, velocity)
+    np.testing.assert_allclose(rate, 0, rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("name", FLIGHTS)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", JOINTS)
 def test_bodies_that_a_joint_connects_keep_energy_and_momenta(name):
     scene, run = flight("directors", name)
     # Round-off and solver, of a hundred steps.

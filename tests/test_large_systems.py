@@ -14,7 +14,7 @@ import enerjax as ej
 from enerjax._programs.sparsity.pattern import jacobian_pattern
 from enerjax._solvers.linear.banded import Band
 from enerjax._solvers.linear.blocks import BlockDiagonal, hessian, inverse_of
-from enerjax._solvers.linear.jacobian import RowPattern
+from enerjax._solvers.linear.jacobian import Dense, RowPattern
 
 from .helpers import EPS, SCHEMES
 
@@ -120,6 +120,16 @@ def test_a_shuffled_band_is_found_and_solved(size):
     y = jax.vjp(factors.solve, right)[1](jnp.asarray(right))[0]
     size_of = np.abs(np.linalg.solve(matrix.T, right)).max()
     assert np.max(np.abs(matrix.T @ y - right)) <= bound * size_of
+
+
+def test_a_dense_matrix_of_columns_that_are_found_together():
+    """Neighbours on a ring share rows; others are found three or four at a time."""
+    fn = lambda x: jnp.sin(x) * jnp.roll(x, 1) + jnp.roll(x, -1) ** 2
+    x = jnp.linspace(0.1, 2.0, 40)
+    pattern = jacobian_pattern(fn, x)
+    assert pattern is not None
+    found = Dense(None, pattern).evaluate(fn, x)
+    np.testing.assert_allclose(found, jax.jacfwd(fn)(x), rtol=0, atol=10 * EPS)
 
 
 def test_the_inertia_of_many_bodies_is_kept_in_blocks():

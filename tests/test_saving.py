@@ -29,6 +29,14 @@ def every_step():
     return run(ej.SaveAt())
 
 
+TIMES = [H, 0.3, STEPS * H]
+
+
+@functools.cache
+def timed():
+    return run(ej.SaveAt(ts=TIMES), t1=STEPS * H)
+
+
 def test_the_end_is_a_row_where_the_steps_do_not_fill_the_last_one():
     thin, full = run(ej.SaveAt(every=10)), every_step()
     rows = np.array([0, 10, 20, 30, 32])
@@ -58,10 +66,8 @@ def test_a_function_of_the_state_is_saved_in_its_place():
     np.testing.assert_allclose(told.audit.energy, full.audit.energy[::8], rtol=1e-13)
     np.testing.assert_allclose(told.end.q, full.ys.q[-1], rtol=0, atol=100 * EPS)
     # Between the steps it is a function of the interpolated state.
-    ts = [0.1, 0.5]
-    within = run(ej.SaveAt(ts=ts, fn=height), t1=STEPS * H)
-    states = run(ej.SaveAt(ts=ts), t1=STEPS * H)
-    np.testing.assert_allclose(within.ys["y"], states.ys.q[:, 1], rtol=0, atol=100 * EPS)
+    within = run(ej.SaveAt(ts=TIMES, fn=height), t1=STEPS * H)
+    np.testing.assert_allclose(within.ys["y"], timed().ys.q[:, 1], rtol=0, atol=100 * EPS)
 
 
 def test_every_accepted_step_of_a_controller_is_counted():
@@ -82,10 +88,8 @@ def test_every_accepted_step_of_a_controller_is_counted():
 
 
 def test_a_number_of_steps_has_rows_at_times_too():
-    ts = [H, 0.3, STEPS * H]
-    counted = run(ej.SaveAt(ts=ts), num_steps=STEPS)
-    timed = run(ej.SaveAt(ts=ts), t1=STEPS * H)
-    np.testing.assert_allclose(counted.ys.q, timed.ys.q, rtol=0, atol=100 * EPS)
+    counted = run(ej.SaveAt(ts=TIMES), num_steps=STEPS)
+    np.testing.assert_allclose(counted.ys.q, timed().ys.q, rtol=0, atol=100 * EPS)
     full = every_step()
     np.testing.assert_allclose(counted.ys.q[0], full.ys.q[1], atol=100 * EPS)
     # The energies of a row are those of the steps that have ended since the row before.

@@ -86,6 +86,7 @@ def test_a_driven_slider_crank_moves_as_its_closed_form():
     near(run.audit.energy, jax.vmap(energy)(t), atol=1e-10)
 
 
+@pytest.mark.slow
 def test_the_motor_of_a_slider_crank_gives_what_its_energy_and_the_damper_take():
     _, run, reaction, multipliers = crank_run()
     leak = np.diff(run.audit.energy) - run.audit.work[1:] - run.audit.drive_work[1:]
@@ -98,6 +99,32 @@ def test_the_motor_of_a_slider_crank_gives_what_its_energy_and_the_damper_take()
     # Truncation, C h^2, of torques up to 60: means over steps.
     np.testing.assert_allclose(torque, power / SPEED, rtol=0, atol=0.05)
     np.testing.assert_array_equal(multipliers[1:, 0], -torque)
+
+
+def test_the_motor_of_a_crank_gives_what_gravity_and_a_brake_take():
+    parts = [
+        Rod("crank", 1.0, [0.0, 0.0], [2 * R, 0.0]),
+        ej.joints.Revolute("shaft", "ground", "crank", [0.0, 0.0]),
+        ej.forces.TorsionDamper("brake", "ground", "crank", DAMPING),
+        ej.drives.Angle("motor", "ground", "crank", constant_speed),
+    ]
+    scene = ej.Scene(parts, [0.0, -9.81], dict(speed=SPEED))
+    system, start, args = scene.build()
+    run = ej.simulate(system, ej.EnergyPreserving(), start, args, h=5e-4, num_steps=200)
+    audit = run.audit
+    angle = SPEED * np.asarray(run.ts)
+    np.testing.assert_allclose(scene.angle(run.ys, "crank"), angle, rtol=0, atol=1e-12)
+    height = R * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    near = functools.partial(np.testing.assert_allclose, rtol=0, atol=1e-12)  # solver
+    near(scene.position(run.ys, "crank"), height)
+    near(np.diff(audit.energy) - audit.work[1:] - audit.drive_work[1:], 0)
+    near(np.diff(audit.energy), 9.81 * np.diff(height[:, 1]))
+    torque = scene.reaction(run, "motor").torque[1:, 0]
+    middle = SPEED * np.asarray(run.ts[1:] + run.ts[:-1]) / 2
+    # Truncation, C h^2: means over steps.
+    expected = 9.81 * R * np.cos(middle) + DAMPING * SPEED
+    np.testing.assert_allclose(torque, expected, rtol=0, atol=1e-3)
+    np.testing.assert_array_equal(scene.multipliers(run, "motor")[1:, 0], -torque)
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import functools
 import inspect
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -106,6 +107,28 @@ def test_a_hinge_in_space_counts_its_turns(body):
         alone = scene.measure(ej.State(run.ys.q[-1], run.ys.v[-1]), "hinge", now).value
         assert abs(alone) <= np.pi
         near([np.cos(alone), np.sin(alone)], [np.cos(turn[-1]), np.sin(turn[-1])])
+
+
+def test_turns_between_rows_are_counted_with_the_mean_rate():
+    """Rows of a motion under a constant torque, in which the rate gains 20 per row."""
+    disc = ej.bodies.RigidBody("disc", 2.0, [0.4] * 3, [0.0] * 3)
+    hinge = ej.joints.Revolute("hinge", "ground", "disc", [0.0] * 3, axis=[0.0, 0.0, 1.0])
+    scene = ej.Scene([disc, hinge])
+    ts = np.arange(5.0)
+    turns, rates = 10 * ts**2 - 3 * ts, 20 * ts - 3
+    bodies = [
+        ej.bodies.RigidBody(
+            "disc", 2.0, [0.4] * 3, [0.0] * 3, [np.cos(a / 2), 0.0, 0.0, np.sin(a / 2)],
+            angular_velocity=[0.0, 0.0, rate],
+        )
+        for a, rate in zip(turns, rates, strict=True)
+    ]  # fmt: skip
+    states = ej.State(np.stack([b.q for b in bodies]), np.stack([b.v for b in bodies]))
+    rows = SimpleNamespace(ys=states, ts=ts, multipliers=np.zeros((5, 11)))
+    seen = scene.measure(rows, "hinge")  # pyright: ignore
+    # Round-off.
+    np.testing.assert_allclose(seen.value, turns, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(seen.rate, rates, rtol=0, atol=1e-12)
 
 
 def points():

@@ -169,6 +169,19 @@ def test_a_small_gap_is_reported_and_closed():
     assert max(gap) <= 1e-14  # round-off
 
 
+def test_a_gap_in_an_angle_is_the_length_of_its_arc():
+    """At the end of a clamped rod, a quarter of a length from its mass centre."""
+    parts = [
+        Rod("rod", 1.0, [0.0, 0.0], [0.5, 0.0]),
+        ej.joints.Fixed("clamp", "ground", "rod", [0.0, 0.0]),
+    ]
+    scene, angle = ej.Scene(parts), 1e-3
+    tilted = 0.25 * np.array([np.cos(angle), np.sin(angle)])
+    gap = scene.report(ej.State([*tilted, angle], [0.0] * 3))["clamp"]
+    # Truncation, of order angle^2.
+    assert gap.position == pytest.approx(0.25 * angle, rel=1e-5)
+
+
 def test_forces_have_the_stated_energies():
     angle = 0.3
     turned = ej.bodies.PlanarBody("arm", 2.0, 0.1, [0.0, 0.0], angle)
@@ -188,6 +201,15 @@ def test_forces_have_the_stated_energies():
     expected = 4 * stretch**2 + 2.5 * 0.2**2 - (-s - 2 * c) - 0.7 * angle + 3 * angle
     energy = scene.system.potential(scene.q, scene.args)
     assert float(energy) == pytest.approx(expected, rel=1e-14)
+
+
+def test_a_torsion_spring_in_the_plane_is_relaxed_at_the_start():
+    turned = ej.bodies.PlanarBody("arm", 2.0, 0.1, [0.0, 0.0], 0.3)
+    scene = ej.Scene([turned, ej.forces.TorsionSpring("coil", "ground", "arm", 5.0)])
+    for further in (0.0, 0.4):
+        q = jnp.asarray(scene.q) + jnp.array([0.0, 0.0, further])
+        energy = float(scene.system.potential(q, scene.args))
+        assert energy == pytest.approx(2.5 * further**2, rel=1e-14)
 
 
 def test_a_torsion_spring_in_space_measures_the_turn_about_its_axis():

@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
+from jax.flatten_util import ravel_pytree
 
 import enerjax as ej
+from enerjax._operators import make_model, scales_like
 
 from .helpers import EPS, long, problem, SCHEMES, solve
 
@@ -179,7 +181,28 @@ def test_a_composition_is_its_stages_one_after_the_other():
     np.testing.assert_allclose(whole.multipliers, impulse, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["Newton", "Chord", "Dogleg", "LevenbergMarquardt"])
+def test_a_backward_stage_is_scaled_like_a_forward_one():
+    """Also in steps of about a length: there the two terms of a scale would cancel."""
+    system, start, args = problem("double")
+    start = ej.State(start.q, jnp.array([0.0, 2.0, 0.0, 2.0]))
+    model, scheme = make_model(system, start, args), ej.EnergyPreserving()
+
+    @jax.jit
+    def scales(h):
+        unknowns = scheme.predict(
+            scheme.problem(model, start, h), jnp.zeros(4), jnp.zeros(2)
+        )
+        return ravel_pytree(scales_like(unknowns, model, start, h))[0]
+
+    for h in (0.02, 0.5):
+        np.testing.assert_allclose(scales(-h), scales(h), rtol=1e-14)  # round-off
+        assert jnp.all(scales(-h) > 0)
+
+
+FINDERS = ["Newton", "Chord", "Dogleg", "LevenbergMarquardt"]
+
+
+@pytest.mark.parametrize("name", long(FINDERS, "Dogleg", "LevenbergMarquardt"))
 def test_another_root_finder_can_be_used(name):
     """The step equations are scaled, so a plain tolerance of a library does."""
     system, start, args = problem("pendulum")

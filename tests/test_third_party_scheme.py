@@ -11,7 +11,7 @@ from .helpers import code_of, EPS, HERE, imported, problem
 from .midpoint_scheme import Midpoint
 
 
-STEPS, DURATION = (16, 32, 64), 0.5
+STEPS, DURATION = (16, 32), 0.5
 
 
 def tip(g, h):

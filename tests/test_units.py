@@ -12,6 +12,16 @@ import enerjax as ej
 from .helpers import failed
 
 
+# Systems are made once, so that other units do not compile other programs.
+ROD = ej.System(
+    lambda v, args: 0.5 * args["m"] * v @ v,
+    lambda q, args: args["m"] * args["g"] * q[1],
+    driven=lambda q, t, args: jnp.stack(
+        [jnp.sqrt(q @ q) - args["l"] - args["a"] * jnp.sin(args["w"] * t)]
+    ),
+)
+
+
 def rod_of_varying_length(metre, second, kilogram):
     """A point in the plane, at rest, on a rod that is driven."""
     args = dict(
@@ -21,14 +31,16 @@ def rod_of_varying_length(metre, second, kilogram):
         a=0.3 * metre,
         w=3.0 / second,
     )
-    length = lambda t, args: args["l"] + args["a"] * jnp.sin(args["w"] * t)
-    system = ej.System(
-        lambda v, args: 0.5 * args["m"] * v @ v,
-        lambda q, args: args["m"] * args["g"] * q[1],
-        driven=lambda q, t, args: jnp.stack([jnp.sqrt(q @ q) - length(t, args)]),
-    )
-    start = ej.initial_state(system, [1.0 * metre, 0.0], [0.0, 0.0], args)
-    return system, start, args
+    start = ej.initial_state(ROD, [1.0 * metre, 0.0], [0.0, 0.0], args)
+    return ROD, start, args
+
+
+def _bead_energy(q, p, args):
+    heavier = jnp.stack([1 + (q[1] / args["l"]) ** 2, 1.0])
+    return 0.5 * jnp.sum(p**2 / (args["m"] * heavier)) + 0.25 * args["k"] * (q @ q) ** 2
+
+
+BEAD = ej.System.from_hamiltonian(_bead_energy)
 
 
 def bead_of_varying_inertia(metre, second, kilogram):
@@ -38,14 +50,8 @@ def bead_of_varying_inertia(metre, second, kilogram):
         l=1.0 * metre,
         k=30.0 * kilogram / (metre * second) ** 2,
     )
-
-    def hamiltonian(q, p, args):
-        heavier = jnp.stack([1 + (q[1] / args["l"]) ** 2, 1.0])
-        return 0.5 * jnp.sum(p**2 / (args["m"] * heavier)) + 0.25 * args["k"] * (q @ q) ** 2
-
-    system = ej.System.from_hamiltonian(hamiltonian)
     momentum = jnp.array([1.0, 0.4]) * kilogram * metre / second
-    return system, ej.State(jnp.array([0.3, 0.8]) * metre, momentum), args
+    return BEAD, ej.State(jnp.array([0.3, 0.8]) * metre, momentum), args
 
 
 @pytest.mark.parametrize("make", [rod_of_varying_length, bead_of_varying_inertia])
