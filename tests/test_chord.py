@@ -77,25 +77,12 @@ CHORDS = {
 }
 
 
-@pytest.mark.parametrize("name", CHORDS)
-@pytest.mark.parametrize("size", [4, pytest.param(80, marks=pytest.mark.slow)])
-def test_without_stiffness_one_correction_solves_the_step(name, size):
-    """With a weight for a potential and constant gradients of the constraints."""
-    rng = np.random.default_rng(0)
-    count = size // 4
-    rows = jnp.asarray(rng.normal(size=(count, 4)))
-    mass = jnp.asarray(rng.uniform(0.5, 2, size=size))
-    system = ej.System(
-        jnp.diag(mass),
-        lambda q, args: 9.81 * jnp.sum(q),
-        lambda q, args: jnp.sum(rows * q.reshape(count, 4), axis=1),
-    )
-    scheme = CHORDS[name]
-    start = ej.initial_state(system, rng.normal(size=size), rng.normal(size=size))
-    assert isinstance(system, ej.System)
+def _left_by_one_correction(scheme, system, start, rng):
+    """The sizes of a residual before and after one correction of the chord method."""
     model = SeparableModel(system, start, None)
     problem = scheme.problem(model, start, jnp.asarray(0.1))
-    z = scheme.predict(problem, jnp.zeros(size), jnp.zeros(count))
+    num_constraints = model.scales.constraint.size
+    z = scheme.predict(problem, jnp.zeros(start.v.size), jnp.zeros(num_constraints))
     flat, unravel = ravel_pytree(z)
     flat = flat + jnp.asarray(rng.normal(size=flat.size))
 
@@ -109,9 +96,45 @@ def test_without_stiffness_one_correction_solves_the_step(name, size):
         )
         return ravel_pytree(residual)[0], ravel_pytree(left)[0]
 
-    before, left = corrected(flat)
-    assert jnp.max(jnp.abs(before)) > 0.1
-    assert jnp.max(jnp.abs(left)) <= 1e4 * EPS  # round-off
+    return (jnp.max(jnp.abs(x)) for x in corrected(flat))
+
+
+@pytest.mark.parametrize("name", CHORDS)
+@pytest.mark.parametrize("size", [4, pytest.param(80, marks=pytest.mark.slow)])
+def test_without_stiffness_one_correction_solves_the_step(name, size):
+    """With a weight for a potential and constant gradients of the constraints."""
+    rng = np.random.default_rng(0)
+    count = size // 4
+    rows = jnp.asarray(rng.normal(size=(count, 4)))
+    mass = jnp.asarray(rng.uniform(0.5, 2, size=size))
+    system = ej.System(
+        jnp.diag(mass),
+        lambda q, args: 9.81 * jnp.sum(q),
+        lambda q, args: jnp.sum(rows * q.reshape(count, 4), axis=1),
+    )
+    start = ej.initial_state(system, rng.normal(size=size), rng.normal(size=size))
+    before, left = _left_by_one_correction(CHORDS[name], system, start, rng)
+    assert before > 0.1
+    assert left <= 1e4 * EPS  # round-off
+
+
+@pytest.mark.parametrize("name", [x for x in CHORDS if "consistent" not in x])
+def test_redundant_coordinates_take_one_correction_too(name):
+    """With a constant map to the velocities, and constant relations of the coordinates."""
+    rng = np.random.default_rng(1)
+    rows, relations = (jnp.asarray(rng.normal(size=(k, 8))) for k in (3, 2))
+    rates = jnp.asarray(rng.normal(size=(6, 8)))
+    system = ej.System(
+        jnp.diag(jnp.asarray(rng.uniform(0.5, 2, size=6))),
+        lambda q, args: 9.81 * jnp.sum(q),
+        lambda q, args: rows @ q,
+        kinematics=lambda q, args: rates,
+        coordinate_constraint=lambda q, args: relations @ q,
+    )
+    start = ej.initial_state(system, rng.normal(size=8), rng.normal(size=6))
+    before, left = _left_by_one_correction(CHORDS[name], system, start, rng)
+    assert before > 0.1
+    assert left <= 1e5 * EPS  # round-off, by the condition of the random matrices
 
 
 # The search -------------------------------------------------------------------------------

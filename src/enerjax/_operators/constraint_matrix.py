@@ -1,30 +1,84 @@
 """The constraint matrix `G = B M^-1 B^T` of the equations for the multipliers."""
 
+from typing import NamedTuple
+
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._solvers import Schur, Symmetric
-from .._types import Multipliers, Velocities
+from .._system import Frames
+from .._types import Increments, Multipliers, Velocities
+from .interval import Increment
+
+
+class Reduced(NamedTuple):
+    """The rows of one node without the coordinate constraints.
+
+    - `rows`: the balance of momentum for the velocities, and the joints.
+    - `relations`: the rows of the coordinate constraints.
+    - `normal`: the components of the balance of momentum in their directions.
+    """
+
+    rows: Increment
+    relations: Array
+    normal: Array
 
 
 class ConstraintMatrix(eqx.Module):
-    """Products and solves with the gradients `B` of all constraints at one position.
+    """Products and solves with the gradients `C` of all joints at one position.
+
+    Gradients are with respect to velocities, so that `G = C M^-1 C^T`.
 
     - `inverse_inertia`: `M^-1`.
-    - `schur`: `B`, and the factors of `G = B M^-1 B^T`.
+    - `schur`: `C`, and the factors of `G`. If coordinates are redundant, it has further
+      columns for the rates of the coordinate constraints, with a weight of zero.
+    - `frames`: the map to the rates of redundant coordinates; `None` if there are none.
     """
 
     inverse_inertia: Symmetric
     schur: Schur
+    frames: Frames | None
 
     def product(self, velocity: Velocities) -> Multipliers:
-        """`B velocity`, the rates of change of the constraints."""
-        return self.schur.product(velocity)
+        """`C velocity`, the rates of change of the joints."""
+        rest = self._num_columns - velocity.size
+        return self.schur.product(jnp.pad(velocity, (0, rest)) if rest else velocity)
 
     def velocity(self, impulses: Multipliers) -> Velocities:
-        """`M^-1 B^T impulses`, the velocities that impulses of the constraints cause."""
-        return self.inverse_inertia @ self.schur.transposed(impulses)
+        """`M^-1 C^T impulses`, the velocities that impulses of the joints cause."""
+        count = self.inverse_inertia.shape[0]
+        return self.inverse_inertia @ self.schur.transposed(impulses)[:count]
 
     def solve(self, right: Float[Array, "k nc"]) -> Float[Array, "k nc"]:
         """`G^-1` times each of `k` vectors."""
         return self.schur.solve(right)
+
+    @property
+    def _num_columns(self) -> int:
+        return self.schur.tables.transposed.shape[0]
+
+    def reduced(self, rows: Increment) -> Reduced:
+        """The rows of a node, with the coordinate constraints taken out."""
+        if self.frames is None:
+            return Reduced(rows, rows.impulse[:0], rows.rate[:0])
+        count, num_joints = self.inverse_inertia.shape[0], self.schur.tables.num_rows
+        joints, relations = rows.impulse[:num_joints], rows.impulse[num_joints:]
+        forces = self.frames.forces(rows.rate)
+        # A change of the coordinates that repairs their relations moves the joints too.
+        joints = joints - self.schur.product(jnp.pad(relations, (count, 0)))
+        inner = Increment(joints, forces[:count], rows.momentum, rows.velocity_impulse)
+        return Reduced(inner, relations, forces[count:])
+
+    def rates(self, velocity: Velocities, reduced: Reduced) -> Increments:
+        """The rates of an increment with this velocity that repair the relations."""
+        if self.frames is None:
+            return velocity
+        return self.frames.rates(jnp.concatenate([velocity, reduced.relations]))
+
+    def normal_forces(self, impulses: Multipliers) -> Array:
+        """The components of `B^T impulses` in the directions of the relations."""
+        count = self.inverse_inertia.shape[0]
+        if self.frames is None:
+            return impulses[:0]
+        return self.schur.transposed(impulses)[count:]

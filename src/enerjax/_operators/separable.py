@@ -25,6 +25,7 @@ from .._solvers import (
     as_dense,
     Assembled,
     inverse_of,
+    padded,
     product,
     row_hessians,
     schur,
@@ -35,6 +36,7 @@ from .._solvers import (
 )
 from .._system import (
     AbstractKinematics,
+    Frames,
     IdentityKinematics,
     RigidKinematics,
     State,
@@ -401,27 +403,39 @@ class SeparableModel(AbstractModel):
 
     def constraint_matrix(self, q: Coordinates, t: Time) -> ConstraintMatrix:
         assert self.constraint_tables is not None
-        rates = self._rates_of_joints(q, t)
-        rest = jnp.zeros((self.inertia.shape[0],), q.dtype)
-        rows = schur(self.constraint_tables, rates, rest, self.inverse_inertia)
-        return ConstraintMatrix(self.inverse_inertia, rows)
+        frames = self._frames(q)
+        rates, weight = self._rates_of_joints(q, t, frames), self._weight()
+        rest = jnp.zeros((weight.shape[0],), q.dtype)
+        rows = schur(self.constraint_tables, rates, rest, weight)
+        return ConstraintMatrix(self.inverse_inertia, rows, frames)
+
+    def _frames(self, q: Coordinates) -> Frames | None:
+        """`L` stacked on `B_c`, where coordinates are redundant."""
+        return self.kinematics.frames(q, jax.jacfwd(self.coordinate), self.args)
 
     def _rates_of_joints(
-        self, q: Coordinates, t: Time
-    ) -> Callable[[Velocities], JointMultipliers]:
-        return lambda v: self.joint_change(q, v, t)
+        self, q: Coordinates, t: Time, frames: Frames | None
+    ) -> Callable[[Array], JointMultipliers]:
+        """The rates of the joints, as a linear function of velocities and of the rates of
+        the coordinate constraints."""
+        rates = lambda v: self.lift(q, v) if frames is None else frames.rates(v)
+        return lambda v: jax.jvp(lambda q: self.joint(q, t), (q,), (rates(v),))[1]
+
+    def _weight(self) -> Symmetric:
+        """The inverse inertia, with zeros for the rates of the coordinate constraints."""
+        rest = jnp.zeros((self.scales.coordinate.size,), self.inverse_inertia.dtype)
+        num_relations = jax.eval_shape(lambda q: self.coordinate(q), rest).size
+        return padded(self.inverse_inertia, num_relations)
 
     def _constraint_tables(self, state: State) -> SchurTables | None:
-        is_flat = self.has_canonical_rates and self.system.coordinate_constraint is None
         # Redundant constraints make the matrix singular.
-        if self.system.redundant or not (
-            is_flat or isinstance(self.kinematics, RigidKinematics)
-        ):
+        if self.system.redundant:
             return None
         t = jnp.zeros((), state.q.dtype) if self.system.is_timed else None
-        rest = jnp.zeros((self.inertia.shape[0],), state.q.dtype)
-        rates = self._rates_of_joints(state.q, t)
-        return schur_tables(rates, rest, self.inverse_inertia)
+        weight = self._weight()
+        rates = self._rates_of_joints(state.q, t, self._frames(state.q))
+        rest = jnp.zeros((weight.shape[0],), state.q.dtype)
+        return schur_tables(rates, rest, weight)
 
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
         """Solves the equations of motion with the joints at acceleration level.

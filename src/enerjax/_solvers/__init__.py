@@ -8,6 +8,7 @@ from .linear.blocks import (
     hessian as hessian,
     in_blocks as in_blocks,
     inverse_of as inverse_of,
+    padded as padded,
     Symmetric as Symmetric,
 )
 from .linear.dense import (

@@ -19,6 +19,7 @@ from .checks.values import direction_without_symmetry as direction_without_symme
 from .elements import Elements as Elements
 from .kinematics import (
     AbstractKinematics as AbstractKinematics,
+    Frames as Frames,
     IdentityKinematics as IdentityKinematics,
 )
 from .rigid_bodies import RigidBodies as RigidBodies, RigidKinematics as RigidKinematics

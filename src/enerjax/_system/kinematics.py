@@ -34,6 +34,26 @@ from .._solvers import (
 from .._types import Args, Coordinates, Increments, Velocities
 
 
+class Frames(eqx.Module):
+    """The invertible matrix of `L` stacked on `B_c` at one position, shape `(nq, nq)`.
+
+    It maps rates of coordinates to velocities and to the rates of the coordinate
+    constraints.
+    """
+
+    blocks: IndependentBlocks | None = eqx.field(static=True)
+    matrix: Float[Array, "nq nq"]
+
+    def rates(self, motion: Float[Array, " nq"]) -> Coordinates:
+        """The rates of the coordinates of velocities and rates of the constraints."""
+        return solve_by_blocks(self.blocks, self.matrix, motion)
+
+    def forces(self, rows: Coordinates) -> Float[Array, " nq"]:
+        """The transpose of `rates`."""
+        _, transpose = jax.vjp(self.rates, rows)
+        return transpose(rows)[0]
+
+
 class AbstractKinematics(eqx.Module):
     """A kind of coordinates `q` with velocities `v = L(q) qdot`."""
 
@@ -45,6 +65,15 @@ class AbstractKinematics(eqx.Module):
         args: Args,
     ) -> "AbstractKinematics":
         """The same map, with the independent blocks of `L` stacked on `B_c`."""
+
+    @abc.abstractmethod
+    def frames(
+        self,
+        q: Coordinates,
+        coordinate_jacobian: Callable[[Coordinates], Float[Array, "ncc nq"]],
+        args: Args,
+    ) -> Frames | None:
+        """`L` stacked on `B_c`; `None` if coordinates are not redundant."""
 
     @abc.abstractmethod
     def displacement(self, q: Coordinates, step: Increments) -> Coordinates:
@@ -124,6 +153,9 @@ class IdentityKinematics(AbstractKinematics):
     def with_blocks(self, q, coordinate, args):
         return self
 
+    def frames(self, q, coordinate_jacobian, args):
+        return None
+
     def displacement(self, q, step):
         return step
 
@@ -168,6 +200,10 @@ class ConfigurationKinematics(AbstractKinematics):
         blocks = independent_blocks(np.concatenate([of_rates, of_relations]))
         return ConfigurationKinematics(self.matrix, blocks)
 
+    def frames(self, q, coordinate_jacobian, args):
+        matrix = jnp.concatenate([self.matrix(q, args), coordinate_jacobian(q)])
+        return Frames(self.blocks, matrix)
+
     def displacement(self, q, step):
         return step
 
@@ -184,8 +220,8 @@ class ConfigurationKinematics(AbstractKinematics):
         return self.lift(q, v, coordinate_jacobian, args)
 
     def lift(self, q, v, coordinate_jacobian, args):
-        square = jnp.concatenate([self.matrix(q, args), coordinate_jacobian(q)])
-        return solve_by_blocks(self.blocks, square, jnp.pad(v, (0, q.size - v.size)))
+        frames = self.frames(q, coordinate_jacobian, args)
+        return frames.rates(jnp.pad(v, (0, q.size - v.size)))
 
     def momentum_rows(self, q, momentum, args):
         if self.blocks is None:

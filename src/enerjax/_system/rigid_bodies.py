@@ -167,6 +167,9 @@ class RigidKinematics(AbstractKinematics):
     def with_blocks(self, q, coordinate, args):
         return self
 
+    def frames(self, q, coordinate_jacobian, args):
+        return None
+
     def displacement(self, q, step):
         bodies, (_, *axes) = self.bodies, self.bodies.pose(q)
         moved, turned = bodies.vectors(step)

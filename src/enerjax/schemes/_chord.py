@@ -1,9 +1,11 @@
 """The corrections of the chord method, in closed form.
 
-The approximate Jacobian contains the inertia and the constraint gradients `B`, and omits
+The approximate Jacobian contains the inertia and the constraint gradients `C`, and omits
 all terms of the stiffness. The right-hand sides are the rows of the balance of momentum
 `r_m`, the constraints divided by `h`, `r_phi`, and their rates `r_psi`. After block
-elimination each kind of multiplier has a linear system with the matrix `G = B M^-1 B^T`.
+elimination each kind of multiplier has a linear system with the matrix `G = C M^-1 C^T`.
+Coordinate constraints are taken out first, and their multipliers follow from the normal
+components of the balance of momentum.
 """
 
 import jax.numpy as jnp
@@ -14,24 +16,27 @@ from ._discontinuous import JumpAndEnd
 
 
 def step_chord(rows: Increment, constraints: ConstraintMatrix) -> Increment:
-    """The correction of a step with `v1 = 2 (rate - M^-1 B^T eta) - v0`; it solves
+    """The correction of a step with `v1 = 2 (rate - M^-1 C^T eta) - v0`; it solves
 
-    2 M rate + B^T (impulse - 2 eta) = r_m
-    B rate = r_phi,   2 B rate - 2 G eta = r_psi
+    2 M rate + C^T (impulse - 2 eta) = r_m
+    C rate = r_phi,   2 C rate - 2 G eta = r_psi
     """
-    free = 0.5 * (constraints.inverse_inertia @ rows.rate)
-    impulse = constraints.product(free) - rows.impulse
-    if rows.velocity_impulse.size == 0:
+    reduced = constraints.reduced(rows)
+    inner = reduced.rows
+    free = 0.5 * (constraints.inverse_inertia @ inner.rate)
+    impulse = constraints.product(free) - inner.impulse
+    if inner.velocity_impulse.size == 0:
         (impulse,) = constraints.solve(impulse[None])
-        reaction = rows.velocity_impulse
+        reaction = inner.velocity_impulse
         both = impulse
     else:
-        right = jnp.stack([impulse, rows.impulse - 0.5 * rows.velocity_impulse])
+        right = jnp.stack([impulse, inner.impulse - 0.5 * inner.velocity_impulse])
         impulse, reaction = constraints.solve(right)
         both = impulse + reaction
+    relations = reduced.normal - constraints.normal_forces(2 * both)
     return Increment(
-        impulse=2 * both,
-        rate=free - constraints.velocity(impulse),
+        impulse=jnp.concatenate([2 * both, relations]),
+        rate=constraints.rates(free - constraints.velocity(impulse), reduced),
         momentum=rows.momentum,
         velocity_impulse=reaction,
     )
@@ -42,14 +47,15 @@ def jump_chord(
 ) -> JumpAndEnd:
     """The correction of a discontinuous step, whose velocities `vj` and `v1` satisfy
 
-        vj + v1 = 2 (rate_1 - M^-1 B^T eta_1)
-        (1 + alpha) vj = 2 rate_1 + 6 rate_j - 2 M^-1 B^T eta_j
+        vj + v1 = 2 (rate_1 - M^-1 C^T eta_1)
+        (1 + alpha) vj = 2 rate_1 + 6 rate_j - 2 M^-1 C^T eta_j
 
-    It solves `M v1 + B^T impulse_1 = r_1` and `M vj - B^T (impulse_1 - impulse_j)/3 = r_j`,
+    It solves `M v1 + C^T impulse_1 = r_1` and `M vj - C^T (impulse_1 - impulse_j)/3 = r_j`,
     with the rows of the constraints at both nodes.
     """
     alpha = alpha.astype(rows.end.rate.dtype)
-    jump, end = rows.jump, rows.end
+    of_jump, of_end = constraints.reduced(rows.jump), constraints.reduced(rows.end)
+    jump, end = of_jump.rows, of_end.rows
     v1, vj = (constraints.inverse_inertia @ x for x in (end.rate, jump.rate))
     is_ggl = end.velocity_impulse.size > 0
     s1, sj = (x.velocity_impulse for x in (end, jump))
@@ -70,17 +76,19 @@ def jump_chord(
     if is_ggl:
         rate = rate + constraints.velocity(eta_1)
         jump_rate = jump_rate + 2 * constraints.velocity(eta_j)
+    relations = of_end.normal - constraints.normal_forces(after)
+    difference = -3 * of_jump.normal - constraints.normal_forces(before)
     return JumpAndEnd(
         jump=Increment(
-            impulse=after - before,
-            rate=(jump_rate - 2 * rate) / 6,
-            momentum=jump.momentum,
+            impulse=jnp.concatenate([after - before, relations - difference]),
+            rate=constraints.rates((jump_rate - 2 * rate) / 6, of_jump),
+            momentum=rows.jump.momentum,
             velocity_impulse=eta_j,
         ),
         end=Increment(
-            impulse=after,
-            rate=rate,
-            momentum=end.momentum,
+            impulse=jnp.concatenate([after, relations]),
+            rate=constraints.rates(rate, of_end),
+            momentum=rows.end.momentum,
             velocity_impulse=eta_1,
         ),
     )

@@ -92,6 +92,20 @@ def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return jnp.linalg.inv(matrix / scale) / scale
 
 
+def padded(matrix: Symmetric, count: int) -> Symmetric:
+    """The matrix with `count` further rows and columns of zeros."""
+    if count == 0:
+        return matrix
+    if not isinstance(matrix, BlockDiagonal):
+        return jnp.pad(matrix, ((0, count), (0, count)))
+    rows, size = matrix.places.rows, matrix.shape[0]
+    labels = np.zeros(size + 1, int)
+    labels[rows.ravel()] = np.repeat(np.arange(len(rows)), rows.shape[1])
+    places = Places(np.append(labels[:size], len(rows) + np.arange(count)))
+    zeros = jnp.asarray(places.padding[len(rows) :], matrix.dtype)
+    return BlockDiagonal(places, jnp.concatenate([matrix.blocks, zeros]))
+
+
 def as_dense(matrix: Symmetric) -> Float[Array, "n n"]:
     """The matrix as a plain array."""
     if not isinstance(matrix, BlockDiagonal):
