@@ -85,8 +85,8 @@ FAULTS = (
     Fault(
         "structure: a stale gyroscopic momentum",
         "_operators/separable.py",
-        "        momentum = self.inertia @ (0.5 * (a.v + b.v))\n",
-        "        momentum = self.inertia @ a.v\n",
+        "            self.inertia @ (0.5 * (a.v + b.v)),\n",
+        "            self.inertia @ a.v,\n",
         "The gyroscopic term, which does no work, takes the momentum of the start.",
         of("problems::test_heavy_top_converges_with_second_order"),
     ),
@@ -166,9 +166,9 @@ FAULTS = (
     ),
     Fault(
         "preserving: one-sided reaction",
-        "schemes/energy_preserving.py",
-        "0.5 * (at_start + at_end)",
-        "at_end",
+        "_operators/separable.py",
+        "0.5 * (self.reaction_at(*a, eta) + self.reaction_at(*b, eta))",
+        "self.reaction_at(*b, eta)",
         "The velocity-level multipliers act at the end of the step only.",
         of("energy::test_at_alpha_zero_the_energy_is_constant"),
     ),

@@ -152,10 +152,10 @@ class RigidBody(AbstractBody):
       the body axes in space along its columns; the identity by default.
     - `angular_velocity`: at the start, in space (angle per time).
 
-    The body has twelve coordinates, the mass centre and the body axes as vectors in space,
-    and six internal constraints. The inertia is constant and points are linear in the
-    coordinates, so that `EnergyPreserving` conserves momenta to round-off, and the
-    equations of many bodies are sparse.
+    The body has twelve coordinates, the mass centre and the body axes as vectors in space.
+    `EnergyPreserving`, `EnergyDecaying` and their compositions move it by rotations, with
+    six unknowns in a step, and `EnergyPreserving` conserves momenta to round-off. Other
+    schemes impose six constraints between its axes; see `rigid_bodies` of `System`.
 
     **Raises:** `ValueError` for moments of inertia that no body has, and for those of a
     flat body or a thin rod, which have no mass along one axis. Give such a body a
@@ -192,7 +192,7 @@ class QuaternionBody(AbstractBody):
     It can be flat, which a `RigidBody` cannot; the arguments are the same. It has seven
     coordinates, the mass centre and a unit quaternion (scalar first); its velocities are
     that of the mass centre and the angular velocity in body axes. Angular momentum is
-    conserved to second order only, the step equations are dense, and `EnergyConsistent`
+    conserved to second order only, and `EnergyConsistent`
     cannot be used.
     """
 

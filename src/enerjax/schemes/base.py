@@ -384,7 +384,7 @@ class AbstractSchemeWithChord(AbstractOneSolveScheme[Z, P], Generic[Z, P]):
     differs from the exact one by terms of relative size `h^2` times stiffness divided by
     inertia. Where these are small, the chord method with this matrix converges quickly, and
     its linear systems have the matrix `B M^-1 B^T`. It is tried first for systems with
-    constant inertia and `v = qdot`. Where it fails, the exact Jacobian is used.
+    constant inertia. Where it fails, the exact Jacobian is used.
     """
 
     @abc.abstractmethod
