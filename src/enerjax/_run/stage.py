@@ -179,7 +179,7 @@ def solve(
         rarely=rarely or wait is not None,
     )
     solved = lambda: _solved(scheme, problem, model, start, memory, prepared, root)
-    return in_one_function(solved)()
+    return solved()
 
 
 class _Prepared(eqx.Module):
