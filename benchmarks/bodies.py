@@ -16,6 +16,7 @@ import time
 from pathlib import Path
 
 import harness
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -50,7 +51,7 @@ def sizes(quick: bool) -> tuple[int, ...]:
     return (2, 6) if quick else tuple(STEPS)
 
 
-def last_body(q: np.ndarray) -> np.ndarray:
+def last_body(q: jax.Array) -> np.ndarray:
     return np.asarray(q[-12:-9])
 
 
