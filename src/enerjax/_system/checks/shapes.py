@@ -108,7 +108,7 @@ def check_shapes(system: AbstractSystem, state: State, args: Args) -> None:
 
 
 def _internal_rows(system: AbstractSystem, state: State) -> int:
-    """The number of constraints between the axes of rigid bodies, whose indices it checks."""
+    """The number of constraints between the axes of rigid bodies; checks the indices."""
     if not isinstance(system, System) or system.rigid_bodies is None:
         return 0
     table = system.rigid_bodies.array

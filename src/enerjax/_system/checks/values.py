@@ -185,10 +185,11 @@ def _messages_of_inertia(system: AbstractSystem, kinetic: str | None) -> dict[st
         "rigid": (
             f"The {inertia} is not that of rigid bodies: with the same velocities in body "
             "axes the kinetic energy changes from one rotation to another. That of each "
-            "body in `rigid_bodies` must be `m |xdot|^2/2 + sum_ij E_ij d_i_dot . d_j_dot/2` "
-            "with its mass centre `x` and axes `d_i`. Is `x` another point of the body, or "
-            "does a term couple bodies? Take the mass centre; a point with the components "
-            "`p_i` in body axes is `x + sum_i p_i d_i`. Or leave out `rigid_bodies` and "
-            "write the constraints between the axes in `constraint`."
+            "body in `rigid_bodies` must be `m |xdot|^2/2 + "
+            "sum_ij E_ij d_i_dot . d_j_dot/2` with its mass centre `x` and axes `d_i`. Is "
+            "`x` another point of the body, or does a term couple bodies? Take the mass "
+            "centre; a point with the components `p_i` in body axes is `x + "
+            "sum_i p_i d_i`. Or leave out `rigid_bodies` and write the "
+            "constraints between the axes in `constraint`."
         ),
     }
