@@ -78,6 +78,7 @@ def _kind(args: Any) -> str:
 
 
 def check_shapes(system: AbstractSystem, state: State, args: Args) -> None:
+    internal = _internal_rows(system, state)
     for role, fn, inputs in energies(system, state, args):
         shape = _shape(role, fn, *inputs)
         if shape != ():
@@ -86,11 +87,12 @@ def check_shapes(system: AbstractSystem, state: State, args: Args) -> None:
                 + (" Sum over the bodies, or index the entry." if shape else "")
             )
     rows = _rows("constraint", system.constraint, state.q, args)
-    rows += _rows("driven", system.driven, state.q, state.t, args)
+    rows += _rows("driven", system.driven, state.q, state.t, args) + internal
     if rows > state.q.size and not system.redundant:
         raise ValueError(
-            f"{rows} constraints of {state.q.size} coordinates cannot be independent. "
-            "Leave out those that follow from the others, or declare "
+            f"{rows} constraints of {state.q.size} coordinates cannot be independent"
+            + (f", {internal} of them between the axes of rigid bodies" if internal else "")
+            + ". Leave out those that follow from the others, or declare "
             "`System(..., redundant=True)`."
         )
     _check_force(system, state, args)
@@ -103,6 +105,20 @@ def check_shapes(system: AbstractSystem, state: State, args: Args) -> None:
             f"`q` has {state.q.size} entries and `v`, the {name}, has {state.v.size}: "
             "give as many of each."
         )
+
+
+def _internal_rows(system: AbstractSystem, state: State) -> int:
+    """The number of constraints between the axes of rigid bodies; checks the indices."""
+    if not isinstance(system, System) or system.rigid_bodies is None:
+        return 0
+    table = system.rigid_bodies.array
+    if table.max(initial=-1) >= state.q.size:
+        raise ValueError(
+            f"`System(rigid_bodies=...)` holds the index {table.max()}, but `q` has "
+            f"{state.q.size} entries, with the indices 0 to {state.q.size - 1}. Each row "
+            "holds the indices of the mass centre and of the three axes of a body."
+        )
+    return 6 * len(table)
 
 
 def energies(

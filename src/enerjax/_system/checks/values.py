@@ -3,13 +3,15 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..._programs import is_known
 from ..._solvers import blocks_of, Symmetric
-from ..._types import Args
+from ..._types import Args, Velocities
 from ..base import AbstractSystem, State
 from ..canonical import HamiltonianSystem, LagrangianSystem
+from ..rigid_bodies import RigidKinematics
 from ..separable import System
 from .shapes import describe, energies
 
@@ -56,6 +58,7 @@ def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]
         quadratic=_is_quadratic(system, state, inertia, args),
         symmetric=jnp.all(jnp.abs(scaled - jnp.swapaxes(scaled, 1, 2)) <= eps),
         definite=jnp.all(masses > 0) & finite(jnp.linalg.cholesky(scaled)),
+        rigid=_is_rigid(system, state, inertia, args),
     )
 
 
@@ -73,6 +76,35 @@ def _is_quadratic(
     error = jnp.abs(energy(probe) - quadratic) + jnp.abs(energy(-probe) - quadratic)
     size = jnp.abs(probe) @ jax.tree.map(jnp.abs, inertia) @ jnp.abs(probe)
     return error <= 1e3 * jnp.finfo(v.dtype).eps * size
+
+
+def _is_rigid(
+    system: AbstractSystem, state: State, inertia: Symmetric, args: Args
+) -> Array:
+    """Whether the kinetic energy of rigid bodies depends on their velocities in body axes
+    alone, as for a body with its mass centre as `x`."""
+    if not isinstance(system, System):
+        return jnp.array(True)
+    bodies = system.bodies(state.q)
+    if bodies is None:
+        return jnp.array(True)
+    kinematics, random = RigidKinematics(bodies), np.random.default_rng(0)
+    count = bodies.num_velocities
+    probe = jnp.cos(jnp.arange(1, count + 1, dtype=state.v.dtype))
+
+    def rates() -> Velocities:
+        """Those of the probe where each body has a random rotation of its own."""
+        axes, _ = np.linalg.qr(random.normal(size=(len(bodies.q), 3, 3)))
+        axes = axes * np.linalg.det(axes)[:, None, None]
+        q = np.zeros(bodies.num_coordinates)
+        q[bodies.q[:, 3:]] = axes.reshape(-1, 9)
+        at = jnp.asarray(q, state.q.dtype)
+        return kinematics.lift(at, probe, lambda q: q[None, :0], args)
+
+    a, b = rates(), rates()
+    energy = lambda v: system.kinetic_energy(State(state.q, v), args)
+    size = jnp.abs(a) @ jax.tree.map(jnp.abs, inertia) @ jnp.abs(a)
+    return jnp.abs(energy(a) - energy(b)) <= 1e3 * jnp.finfo(a.dtype).eps * size
 
 
 def check_values(system: AbstractSystem, state: State, args: Args) -> None:
@@ -149,5 +181,15 @@ def _messages_of_inertia(system: AbstractSystem, kinetic: str | None) -> dict[st
         "definite": (
             f"The {inertia} is not positive definite. {missing} Every velocity needs some "
             "inertia."
+        ),
+        "rigid": (
+            f"The {inertia} is not that of rigid bodies: with the same velocities in body "
+            "axes the kinetic energy changes from one rotation to another. That of each "
+            "body in `rigid_bodies` must be `m |xdot|^2/2 + "
+            "sum_ij E_ij d_i_dot . d_j_dot/2` with its mass centre `x` and axes `d_i`. Is "
+            "`x` another point of the body, or does a term couple bodies? Take the mass "
+            "centre; a point with the components `p_i` in body axes is `x + "
+            "sum_i p_i d_i`. Or leave out `rigid_bodies` and write the "
+            "constraints between the axes in `constraint`."
         ),
     }
