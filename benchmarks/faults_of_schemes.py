@@ -195,7 +195,7 @@ FAULTS = (
         "((kappa > 0) & (kappa < 2))",
         "(kappa < 2)",
         "A step with a negative kappa is a success.",
-        of("failures::test_a_negative_kappa_is_a_failure_too"),
+        of("failures::test_kappa_must_be_between_zero_and_two"),
     ),
     Fault(
         "consistent: the skew gradient does work on drives",

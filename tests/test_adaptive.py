@@ -1,7 +1,6 @@
 """Adaptive steps: their errors, their energy, their derivatives."""
 
 import functools
-from types import SimpleNamespace
 from typing import Any
 
 import equinox as eqx
@@ -92,8 +91,8 @@ def test_a_step_is_accepted_by_the_root_mean_square_of_its_error(size, is_accept
     bound = atol + rtol * jnp.maximum(jnp.abs(start.q), jnp.abs(there))
     end = ej.State(there + part * bound, start.v)
     model = make_model(system, start, None)
-    out = SimpleNamespace(state=end, result=ej.RESULTS.successful)
-    verdict = plan.judge(plan.begin(model, start), model, start, out, h)  # pyright: ignore
+    memory = plan.begin(model, start)
+    verdict = plan.judge(memory, model, (start, end), ej.RESULTS.successful, h)
     assert bool(verdict.accepted) == is_accepted
 
 

@@ -1,11 +1,13 @@
 """Failures are values: they are reported where they happen, and earlier rows stay valid."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import enerjax as ej
+from enerjax._operators import make_model
 
 from .helpers import failed, problem, solve, TURNOVER
 
@@ -66,14 +68,17 @@ def test_rows_before_a_failure_are_those_of_a_shorter_run(name, scheme, alpha, h
         np.testing.assert_allclose(x[: done + 1], y, rtol=0, atol=1e-9)
 
 
-def test_a_negative_kappa_is_a_failure_too():
-    h = 0.006
-    solution = run("double", "kappa", 0.5, h)
-    assert solution.result == ej.RESULTS.kappa_out_of_range
-    system, _, args = problem("double")
-    out = ej.step(system, ej.KappaDecaying(0.5), solution.end, args, h=h)
-    assert out.result == ej.RESULTS.kappa_out_of_range
-    assert float(out.details) < 0
+@pytest.mark.parametrize(
+    ("kappa", "is_bounded"), [(-0.1, False), (1.5, True), (2.1, False)]
+)
+def test_kappa_must_be_between_zero_and_two(kappa, is_bounded):
+    system, start, args = problem("double")
+    scheme, model = ej.KappaDecaying(0.5), make_model(system, start, args)
+    step = scheme.problem(model, start, jnp.asarray(0.01))
+    z = scheme.predict(step, *model.accelerations(start))
+    z = eqx.tree_at(lambda z: z.kappa, z, jnp.array([kappa]))
+    failed = scheme.finish(z, step).result == ej.RESULTS.kappa_out_of_range
+    assert bool(failed) != is_bounded
 
 
 @pytest.mark.slow

@@ -312,12 +312,12 @@ class AbstractModel(eqx.Module):
         none = jnp.zeros((0,), state.q.dtype)
         return symmetry(state.q, self.args) @ self.momentum(state) if symmetry else none
 
-    def split(self, increment: Increment) -> tuple[Increment, Increment]:
+    def split(self, increment: Increment, q: Coordinates) -> tuple[Increment, Increment]:
         """Two increments: one with the multipliers of the time-independent constraints
-        only, and one with those of the driven constraints only."""
+        only, and one with those of the driven constraints only; `q` is any position."""
         if self.system.driven is None:
             return increment, increment
-        q, t = increment.rate, jnp.zeros((), increment.rate.dtype)
+        t = jnp.zeros((), q.dtype)
         first = jax.eval_shape(self.fixed, q).size
         last = first + jax.eval_shape(self.driven, q, t).size
 

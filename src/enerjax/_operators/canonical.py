@@ -140,7 +140,7 @@ class CanonicalModel(AbstractModel):
         is_step: bool,
     ) -> Gradient:
         size = a.q.size
-        fixed, driven = self.split(increment)
+        fixed, driven = self.split(increment, a.q)
 
         def action(z: Float[Array, " nz"]) -> Scalar:
             q, p = z[:size], z[size:]

@@ -239,7 +239,7 @@ class SeparableModel(AbstractModel):
         *,
         is_step: bool,
     ) -> Gradient:
-        fixed, driven = self.split(increment)
+        fixed, driven = self.split(increment, a.q)
         eta, torque = increment.velocity_impulse, None
         mean_velocity = 0.5 * (a.v + b.v)
         mean_rate = lambda q: self.lift(q, mean_velocity)
