@@ -40,6 +40,9 @@ class EnergyDecaying(AbstractSchemeWithRotations[JumpAndEnd, StepProblem]):
       oscillator of frequency `w` the spectral radius of a step tends to
       `rho_inf = (1 - alpha) / (1 + alpha)` as `h w` grows. Forces enter the intervals like
       `-grad V`; a damper `-C v` with constant `C` never creates energy.
+    - Rigid bodies in space (`rigid_bodies` of a `System`) are moved by rotations. The
+      angular momentum of a free body is conserved; that of connected bodies drifts with
+      third order in each step.
     - Constraints held at: position level at `zj` and `z1`; with `formulation="ggl"`
       velocity level too.
     - Order: 2. For unconstrained systems with `v = qdot` it is 3 with `MeanValue()` or with

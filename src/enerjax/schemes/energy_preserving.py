@@ -21,6 +21,8 @@ class EnergyPreserving(AbstractSchemeWithRotations[Increment, StepProblem]):
     - Dissipates: nothing, not even high-frequency oscillations.
     - Constraints held at: position level; with `formulation="ggl"` velocity level too.
     - Order: 2. Symmetric: `Composed` raises the order to 4, 6 or 8.
+    - Rigid bodies in space (`rigid_bodies` of a `System`) are moved by rotations; linear
+      and angular momentum are conserved to round-off where forces permit it.
 
     **Arguments:**
 
@@ -29,7 +31,8 @@ class EnergyPreserving(AbstractSchemeWithRotations[Increment, StepProblem]):
     - `derivative`: the discrete gradient.
 
     **Reference:** E. Lens and A. Cardona, section 4.1, eq. (14). The `"ggl"` form adds
-    the stabilisation of C. W. Gear, B. Leimkuhler and G. K. Gupta (1985).
+    the stabilisation of C. W. Gear, B. Leimkuhler and G. K. Gupta (1985). Rotations: J. C.
+    Simo and K. K. Wong (1991), with discrete gradients of any potential and constraints.
     """
 
     formulation: Formulation = eqx.field(  # pyright: ignore[reportIncompatibleMethodOverride]
