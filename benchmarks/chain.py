@@ -148,16 +148,7 @@ def show(rows: list[harness.Row]) -> None:
 
 
 def draw(rows: list[harness.Row], path: Path) -> None:
-    import matplotlib.pyplot as plt
-
-    figure, axis = plt.subplots(figsize=(6, 4), layout="constrained")
-    for mode, mark in (("exudyn", "s-"), ("default", "o-"), ("fast", "^-")):
-        chosen = [row for row in rows if row["mode"] == mode and "us_per_step" in row]
-        sizes = [row["work"] for row in chosen]
-        axis.loglog(sizes, [row["us_per_step"] for row in chosen], mark, label=mode)
-    axis.set(xlabel="links", ylabel="microseconds a step", title="chains, h = 1 ms")
-    axis.legend()
-    figure.savefig(path, dpi=130)
+    harness.draw_costs(rows, path, "links", "chains, h = 1 ms")
 
 
 if __name__ == "__main__":
