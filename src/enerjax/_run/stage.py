@@ -16,7 +16,6 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from .._operators import AbstractModel, Increment, roughness, scales_like, shortened
-from .._programs import in_one_function
 from .._results import first_failure, from_root_finder, RESULTS
 from .._solvers import (
     AbstractFactors,
@@ -151,10 +150,7 @@ def solve(
 ) -> Solved:
     """Solves a step of length `h`. With `skip` it makes no iteration; see `find_root`."""
     problem = _problem(scheme, model, start, h, memory.carried)
-    # The parts of a step are compiled as one function each, because the search may not be.
-    prepared = in_one_function(
-        lambda: _prepared(scheme, problem, model, start, h, memory)
-    )()
+    prepared = _prepared(scheme, problem, model, start, h, memory)
     unknown_scale, row_scale = prepared.unknown_scale, prepared.row_scale
 
     def scaled(x, inputs):
@@ -178,8 +174,7 @@ def solve(
         by_chord=True if wait is None else wait == 0,
         rarely=rarely or wait is not None,
     )
-    solved = lambda: _solved(scheme, problem, model, start, memory, prepared, root)
-    return solved()
+    return _solved(scheme, problem, model, start, memory, prepared, root)
 
 
 class _Prepared(eqx.Module):
