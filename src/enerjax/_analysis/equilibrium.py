@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._operators import AbstractModel, make_model
-from .._programs import is_known
+from .._programs import compiled, is_known
 from .._solvers import find_root, largest, Newton, RootFinder
 from .._system import AbstractSystem, check_system, HamiltonianSystem, State
 from .._types import Args, Coordinates, Flag, Multipliers, Real, Scalar
@@ -97,7 +97,7 @@ def at_rest(
     return State(state.q, jnp.zeros_like(state.v), state.t), args
 
 
-@eqx.filter_jit
+@compiled
 def _solve(
     system: AbstractSystem, guess: State, args: Args, root_finder: RootFinder
 ) -> tuple[Equilibrium, Scalar, Flag]:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._operators import make_model
-from .._programs import is_known
+from .._programs import compiled, is_known
 from .._system import AbstractSystem, check_system, State, System
 from .._types import (
     Args,
@@ -175,7 +175,7 @@ def _start(
     )
 
 
-@eqx.filter_jit
+@compiled
 def _is_consistent(system: AbstractSystem, state: State, args: Args) -> Flag:
     """Whether each constraint and its rate vanish to round-off."""
     model = make_model(system, state, args)
@@ -216,7 +216,7 @@ def _indices(name: str, indices: EntryIndices, x: Array) -> tuple[int, ...]:
     return tuple(sorted(set(array.tolist())))
 
 
-@eqx.filter_jit
+@compiled
 def _project(
     system: AbstractSystem,
     guess: State,

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float
 
 from .._operators import make_model
+from .._programs import compiled
 from .._solvers import as_dense
 from .._system import AbstractSystem, check_system, State
 from .._types import Args, Real
@@ -166,7 +166,7 @@ def scaled_constraints(
     return scaled / unit[:, None], root, residual / np.where(size > 0, size, 1.0)
 
 
-@eqx.filter_jit
+@compiled
 def _linearised(
     system: AbstractSystem, state: State, args: Args
 ) -> tuple[Array, Array, Array, Array]:

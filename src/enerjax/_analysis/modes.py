@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._operators import make_model
-from .._programs import is_known
+from .._programs import compiled, is_known
 from .._solvers import as_dense, cholesky, eigh, inverse
 from .._system import AbstractSystem, State
 from .._types import Args, Coordinates, Real, Scalar
@@ -112,7 +112,7 @@ def _check_balance(balance: _Balance) -> None:
         )
 
 
-@eqx.filter_jit
+@compiled
 def _modes(
     system: AbstractSystem, rest: State, args: Args, kept: tuple[int, ...] | None
 ) -> tuple[Modes, _Balance]:

@@ -3,14 +3,13 @@
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .._discrete import AbstractCorrected, AbstractDerivative, ChainRule
-from .._programs import is_known
+from .._programs import compiled, is_known
 from .._system import (
     AbstractSystem,
     describe,
@@ -88,7 +87,7 @@ def _functions(
     return found
 
 
-@eqx.filter_jit
+@compiled
 def _facts(
     derivative: AbstractDerivative, system: AbstractSystem, state: State, args: Args
 ) -> list[tuple[Flag, Flag]]:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
+from .._programs import compiled
 from .._solvers import Newton, RootFinder
 from .._system import AbstractSystem, State
 from .._types import Args, Real, Scalar
@@ -123,7 +124,7 @@ class _Task(eqx.Module):
     max_halvings: int | None
 
 
-@eqx.filter_jit
+@compiled
 def _run(task: _Task) -> tuple[Solution, Scalar]:
     """The run, and the time that it has reached."""
     plan, saving, fn = task.plan, task.saving, task.fn

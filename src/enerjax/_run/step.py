@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from .._operators import AbstractModel, local_error, make_model
-from .._programs import in_one_function
+from .._programs import compiled, in_one_function
 from .._results import first_of, RESULTS
 from .._solvers import largest, Newton, RootFinder
 from .._system import AbstractSystem, State
@@ -151,7 +151,7 @@ def _sum_and_rest(x: Array, y: Array) -> tuple[Array, Array]:
     return total, jax.lax.stop_gradient(rest)
 
 
-@eqx.filter_jit
+@compiled
 def _single_step(system, scheme, state, args, h, warm, root_finder, max_halvings):
     model = model_for(scheme, system, state, args)
     state = model.to_internal(state)

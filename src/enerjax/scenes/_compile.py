@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._programs import is_known
+from .._programs import compiled, is_known
 from .._types import Coordinates
 from ._arguments import module_of, number
 from ._ends import Ends, Hinge, Hinges
@@ -190,7 +189,7 @@ class _StartPose:
         )
 
 
-@eqx.filter_jit
+@compiled
 def _all_frames(layout: Layout, q: Coordinates) -> Frame:
     view = View(layout, q)
     return Frame(view.origins, view.axes, view.angles)

@@ -2,11 +2,11 @@
 
 from typing import NamedTuple, TypeAlias
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._programs import compiled
 from .._types import Coordinates, Scalar
 from ._constraint_rows import members
 from ._frames import Frame, Numbers
@@ -43,7 +43,7 @@ class Measured(NamedTuple):
 Columns: TypeAlias = tuple[Array, Array, Array, Array]
 
 
-@eqx.filter_jit
+@compiled
 def measured(
     layout: Layout, q: Coordinates, qdot: Coordinates, t: Scalar, args: Parameters
 ) -> list[Columns]:

@@ -2,12 +2,12 @@
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._analysis import ConsistentStart, Equilibrium
+from .._programs import compiled
 from .._system import State
 from .._types import Real, Scalar
 from ._feedback import link_of, measure_of, Moving
@@ -45,7 +45,7 @@ class Readout(NamedTuple):
     force: Array | None
 
 
-@eqx.filter_jit
+@compiled
 def readout(
     layout: Layout,
     name: str,

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._programs import is_known
+from ..._programs import compiled, is_known
 from ..._solvers import blocks_of, Symmetric
 from ..._types import Args, Velocities
 from ..base import AbstractSystem, State
@@ -21,7 +21,7 @@ def direction_without_symmetry(x: Float[Array, " n"]) -> Float[Array, " n"]:
     return 1 + 0.5 * jnp.cos(jnp.arange(x.size, dtype=x.dtype))
 
 
-@eqx.filter_jit
+@compiled
 def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]:
     inertia = system.inertia(state, args)
     blocks, eps = blocks_of(inertia), 1e3 * jnp.finfo(inertia.dtype).eps

@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 from typing_extensions import TypeAliasType
 
-from ..._programs import is_known
+from ..._programs import compiled, is_known
 from ..._run import positive_integer
 from .estimate import covariance, Fit, names_of, student, Unknowns
 
@@ -93,7 +93,7 @@ def fit(
     return _raise_failure(found, undetermined) if throw else found
 
 
-@eqx.filter_jit
+@compiled
 def _fit(residuals, unknowns, numbers, data, solver, max_steps, guess):
     def vector(x: Array, data: Any) -> Array:
         return ravel_pytree(residuals(unknowns.parameters(x), data))[0]

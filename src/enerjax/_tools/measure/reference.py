@@ -4,13 +4,13 @@ import dataclasses
 import math
 from typing import Any, TypeAlias
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
 from ..._operators import make_model
+from ..._programs import compiled
 from ..._results import RESULTS
 from ..._run import SaveAt, simulate, Solution
 from ..._system import AbstractSystem, State
@@ -60,7 +60,7 @@ class Task:
         return jax.block_until_ready(solution)
 
 
-@eqx.filter_jit
+@compiled
 def _run(
     system: AbstractSystem,
     scheme: AbstractScheme,
@@ -140,7 +140,7 @@ def at_states(task: Task, q: Reals, v: Reals) -> Values:
     return Values(q, v, np.asarray(multipliers), np.asarray(energy))
 
 
-@eqx.filter_jit
+@compiled
 def _balance(system: AbstractSystem, states: State, args: Args):
     def at(state: State):
         if not system.is_timed:

@@ -8,6 +8,8 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
+from ..._programs import compiled
+
 
 # The fastest batch of lanes on CPUs according to benchmarks/batch.py: more lanes do not fit
 # into the cache of a core, and all wait for the slowest. (Lanes of small systems run one
@@ -39,9 +41,9 @@ def make_lane(fn: Callable, parameters: dict[str, Any]) -> tuple[Any, Any]:
                 )
         return values
 
-    compiled = jax.jit(lane)
+    program = jax.jit(lane)
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), parameters)
-    return compiled, compiled.trace(one)
+    return program, program.trace(one)
 
 
 class Chunk:
@@ -66,7 +68,7 @@ class Chunk:
             of_device = jax.shard_map(
                 of_device, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
             )
-        self._program = jax.jit(of_device)
+        self._program = compiled(of_device)
 
     def __call__(self, parameters: dict[str, Any]) -> list[np.ndarray]:
         """The leaves of the results of `lanes` lanes."""
