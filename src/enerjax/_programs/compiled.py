@@ -8,6 +8,8 @@ import equinox as eqx
 import jax
 from jax.core import Tracer
 
+from .tracing import is_known
+
 
 # XLA's CPU back end has two generators of code for merged operations. The newer one, which
 # is the default, takes twice as long, and its programs are not faster: two hinged bodies
@@ -21,16 +23,23 @@ Value = TypeVar("Value")
 def compiled(fn: Callable[Arguments, Value]) -> Callable[Arguments, Value]:
     """`equinox.filter_jit(fn)`, which compiles in about half the time on CPUs.
 
-    Inside of another `jax.jit` the options of that one decide.
+    Inside of another `jax.jit`, and under `jax.grad` and other transformations, the program
+    becomes part of another one, whose options decide.
     """
     jit: Any = eqx.filter_jit
     alone, within = jit(fn, compiler_options=_QUICKLY), jit(fn)
 
     @functools.wraps(fn)
     def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Value:
-        # JAX refuses options of a `jit` inside of another one.
-        program = within if _is_traced() or not _are_known() else alone
-        return program(*args, **kwargs)
+        if _is_traced() or not (is_known((args, kwargs)) and _are_known()):
+            return within(*args, **kwargs)
+        try:
+            return alone(*args, **kwargs)
+        except ValueError as error:
+            # JAX refuses options where a function in `args` has a traced closure.
+            if "compiler_options" not in str(error):
+                raise
+            return within(*args, **kwargs)
 
     return call
 

@@ -3,9 +3,12 @@
 When a chain cracks like a whip, or near a singular pose, Newton's method finds no solution
 for some steps, but it does for shorter ones. The energy identity holds for steps of any
 length, so dividing a step costs nothing but its uniform length.
+
+A run is a loop over attempts, whose body solves one step, whole or a part: one program
+solves them all. Reverse mode cannot differentiate such a loop. Its derivatives are those of
+a whole step, and of a scan over the parts behind a condition.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -19,11 +22,51 @@ from .._solvers import RootFinder, SMALL
 from .._system import State
 from .._types import Count, Flag, Scalar
 from ..schemes import AbstractOneSolveScheme, AbstractSchemeWithMemory, StepEnd
-from .stage import first_memory, Memory, num_unknowns, solve, Solved
+from .stage import first_memory, Memory, num_unknowns, solve, Solved, unsolved
 
 
 # The default for large systems: their steps take far longer than compiling the division.
 _HALVINGS_OF_LARGE_SYSTEMS = 3
+# A wait for the chord method that is longer than any division.
+_NO_CHORD = 2**30
+
+
+class _Step(eqx.Module):
+    """A step that is to be solved, with the arguments of `solve`."""
+
+    scheme: AbstractOneSolveScheme
+    model: AbstractModel
+    start: State
+    h: Scalar
+    memory: Memory
+    root_finder: RootFinder
+    skip: Flag
+
+    def solve(self, rarely: bool = False) -> Solved:
+        """The whole step."""
+        return solve(
+            self.scheme,
+            self.model,
+            self.start,
+            self.h,
+            self.memory,
+            self.root_finder,
+            self.skip,
+            rarely=rarely,
+        )
+
+    def part(self, sofar: Solved, k: Scalar, count: Scalar, skip: Flag) -> "_Step":
+        """Part `k` of `count`, after the parts in `sofar`."""
+        length = self.h / count
+        return _Step(
+            scheme=self.scheme,
+            model=self.model,
+            start=_at_time(sofar.end.state, self.start, k * length),
+            h=length,
+            memory=sofar.memory,
+            root_finder=self.root_finder,
+            skip=skip,
+        )
 
 
 def solve_or_divide(
@@ -41,124 +84,166 @@ def solve_or_divide(
     By default a step of a large system may be halved three times, and that of a small
     system not at all.
     """
-    whole = solve(scheme, model, start, h, memory, root_finder, skip)
+    step = _Step(scheme, model, start, h, memory, root_finder, skip)
     if max_halvings is None:
         is_large = num_unknowns(memory) > SMALL
         max_halvings = _HALVINGS_OF_LARGE_SYSTEMS if is_large else 0
-    none = jnp.array(0)
     if max_halvings == 0:
-        return whole, none
+        return step.solve(), jnp.array(0)
+    return _solve_or_divide(step, max_halvings)
+
+
+class _Attempts(eqx.Module):
+    """The carry of the loop over attempts.
+
+    - `sofar`: the solved parts of the step.
+    - `halvings`, `k`: there are `2**halvings` parts, and `k` of them are solved.
+    """
+
+    sofar: Solved
+    halvings: Count
+    k: Count
+
+    @property
+    def unfinished(self) -> Flag:
+        """Whether a part is left, and none has failed for good."""
+        # XLA searches the body of a loop whose condition reads a single number of the
+        # carry for a count of its passes, again and again, which takes seconds.
+        left = self.k < (1 << self.halvings)
+        return left & (self.sofar.result == RESULTS.successful)
+
+
+@eqx.filter_custom_jvp
+def _solve_or_divide(step: _Step, max_halvings: int) -> tuple[Solved, Count]:
+    wait = None if step.memory.chord_wait is None else jnp.array(_NO_CHORD)
+
+    def attempt(before: _Attempts) -> _Attempts:
+        count = (1 << before.halvings).astype(step.h.dtype)
+        k = before.k.astype(step.h.dtype)
+        new = step.part(before.sofar, k, count, step.skip).solve()
+        sofar = _joined(before.sofar, new, count)
+        failed = (new.result != RESULTS.successful) & ~step.skip
+        divides = failed & (before.halvings < max_halvings)
+
+        def again() -> Solved:
+            memory = _memory_of_parts(step, 2 * count, wait)
+            return select(divides, _nothing(step, sofar, memory), sofar)
+
+        halvings = before.halvings + divides.astype(before.halvings.dtype)
+        return _Attempts(
+            sofar=jax.lax.cond(in_any_lane(divides), again, lambda: sofar),
+            halvings=halvings,
+            k=jnp.where(divides, 0, before.k + 1),
+        )
+
+    nothing = unsolved(step.scheme, step.model, step.start, step.h, step.memory)
+    first = _Attempts(nothing, jnp.array(0), jnp.array(0))
+    last = jax.lax.while_loop(lambda carry: carry.unfinished, attempt, first)
+    divided = last.halvings > 0
+
+    def after() -> Solved:
+        count = (1 << last.halvings).astype(step.h.dtype)
+        return select(divided, _with_memory_after(step, last.sofar, count), last.sofar)
+
+    return jax.lax.cond(in_any_lane(divided), after, lambda: last.sofar), last.halvings
+
+
+@_solve_or_divide.def_jvp
+def _solve_or_divide_jvp(primals: Any, tangents: Any) -> Any:
+    """The derivatives of a whole step and, if it has failed, of its parts."""
+    (step, max_halvings), (t_step, _) = primals, tangents
+    in_parts = lambda step: _solve_and_divide(step, max_halvings)
+    return eqx.filter_jvp(in_parts, (step,), (t_step,))
+
+
+def _solve_and_divide(step: _Step, max_halvings: int) -> tuple[Solved, Count]:
+    """`_solve_or_divide` as a program that can be differentiated in reverse mode."""
+    whole = step.solve()
 
     def halve(carry: tuple[Solved, Count], times: Count):
         before, halvings = carry
-        failed = (before.result != RESULTS.successful) & ~skip
+        failed = (before.result != RESULTS.successful) & ~step.skip
 
         def again():
-            count, max_count = (2**times).astype(h.dtype), 2**max_halvings
-            new = _divided(
-                scheme, model, start, h, memory, root_finder, before, count, max_count
+            return select(
+                failed, (_divided(step, before, times, max_halvings), times), carry
             )
-            return select(failed, (new, times), carry)
 
         return jax.lax.cond(in_any_lane(failed), again, lambda: carry), None
 
     def all_halvings():
-        return jax.lax.scan(halve, (whole, none), jnp.arange(1, max_halvings + 1))[0]
+        times = jnp.arange(1, max_halvings + 1)
+        return jax.lax.scan(halve, (whole, jnp.array(0)), times)[0]
 
     # The reverse pass repeats a divided step instead of storing it, because it is rare.
     repeated = jax.checkpoint(all_halvings, policy=jax.checkpoint_policies.nothing_saveable)
-    failed = (whole.result != RESULTS.successful) & ~skip
-    return jax.lax.cond(in_any_lane(failed), repeated, lambda: (whole, none))
+    failed = (whole.result != RESULTS.successful) & ~step.skip
+    return jax.lax.cond(in_any_lane(failed), repeated, lambda: (whole, jnp.array(0)))
 
 
-def _divided(
-    scheme: AbstractOneSolveScheme,
-    model: AbstractModel,
-    start: State,
-    h: Scalar,
-    memory: Memory,
-    root_finder: RootFinder,
-    before: Solved,
-    count: Scalar,
-    max_count: int,
-) -> Solved:
-    """A step as `count` equal steps, of which there may be `max_count`.
+def _divided(step: _Step, before: Solved, times: Count, max_halvings: int) -> Solved:
+    """A step in `2**times` parts; `before` is the last attempt, which failed."""
+    count = (1 << times).astype(step.h.dtype)
 
-    `before` is the last attempt, which failed.
-    """
-    length = h / count
-    first_memory, last_memory = _memories(scheme, model, start, h, memory, count)
-
-    def one_step(sofar: Solved, k: Scalar):
+    def one_part(sofar: Solved, k: Scalar):
         unused = (sofar.result != RESULTS.successful) | (k >= count)
-        state = _at_time(sofar.end.state, start, k * length)
-        new = solve(
-            scheme, model, state, length, sofar.memory, root_finder, unused, rarely=True
-        )
+        new = step.part(sofar, k, count, unused).solve(rarely=True)
         return select(unused, sofar, _joined(sofar, new, count)), None
 
-    zero = jax.tree.map(jnp.zeros_like, before.end)
-    nothing = StepEnd(
-        state=State(start.q, start.v, before.end.state.t),
-        displacement=zero.displacement,
-        multipliers=zero.multipliers,
-        energies=zero.energies,
-        details=before.end.details,
-        carried=before.end.carried,
+    parts = jnp.arange(2**max_halvings, dtype=step.h.dtype)
+    nothing = _nothing(step, before, _memory_of_parts(step, count, None))
+    done, _ = jax.lax.scan(one_part, nothing, parts)
+    return _with_memory_after(step, done, count)
+
+
+def _nothing(step: _Step, before: Solved, memory: Memory) -> Solved:
+    """A step of which no part is solved, after the failed attempt `before`."""
+    nothing = unsolved(step.scheme, step.model, step.start, step.h, memory)
+    return eqx.tree_at(
+        lambda solved: (solved.iterations, solved.residual),
+        nothing,
+        (before.iterations, before.residual),
     )
-    first = Solved(
-        end=nothing,
-        iterations=before.iterations,
-        residual=before.residual,
-        result=RESULTS.successful,
-        roughness=before.roughness,
-        memory=first_memory,
-    )
-    done, _ = jax.lax.scan(one_step, first, jnp.arange(max_count, dtype=h.dtype))
-    state = _at_time(done.end.state, start, h)
-    return eqx.tree_at(lambda done: done.memory, done, last_memory(state, done.memory))
 
 
-def _memories(
-    scheme: AbstractOneSolveScheme,
-    model: AbstractModel,
-    start: State,
-    h: Scalar,
-    memory: Memory,
-    count: Scalar,
-) -> tuple[Memory, Callable[[State, Memory], Memory]]:
-    """The memory of the first of `count` equal steps, and that after the last of them.
+def _memory_of_parts(step: _Step, count: Scalar, chord_wait: Count | None) -> Memory:
+    """The memory of the first of `count` parts.
 
-    The second is a function of the state at the end and the memory of the last short step.
-    The short steps use Newton's method alone, because a chord method for these rare steps
-    would take long to compile.
+    The parts use Newton's method alone: the chord method has failed, or was waiting.
     """
-    if isinstance(scheme, AbstractSchemeWithMemory):
-
-        def begin(state: State, length: Scalar) -> Memory:
-            return first_memory(scheme, model, state, length, *model.accelerations(state))
-
-        return begin(start, h / count), lambda state, last: begin(state, h)
-    # What a step adds to a free flight is proportional to its length.
-    scaled = lambda factor, added: jax.tree.map(lambda x: factor * x, added)
-    by_newton = Memory(
-        added=scaled(1 / count, memory.added),
+    if isinstance(step.scheme, AbstractSchemeWithMemory):
+        return _begun(step, step.start, step.h / count)
+    memory = step.memory
+    return Memory(
+        # What a step adds to a free flight is proportional to its length.
+        added=jax.tree.map(lambda x: x / count, memory.added),
         is_smooth=jnp.array(False),
         factors=memory.factors,
-        chord_wait=None,
+        chord_wait=chord_wait,
         carried=memory.carried,
     )
 
-    def after(_: State, last: Memory) -> Memory:
-        return Memory(
-            added=scaled(count, last.added),
+
+def _with_memory_after(step: _Step, done: Solved, count: Scalar) -> Solved:
+    """The solved parts, with a memory for the next whole step."""
+    last = done.memory
+    if isinstance(step.scheme, AbstractSchemeWithMemory):
+        memory = _begun(step, _at_time(done.end.state, step.start, step.h), step.h)
+    else:
+        memory = Memory(
+            added=jax.tree.map(lambda x: count * x, last.added),
             is_smooth=jnp.array(False),
             factors=last.factors,
-            chord_wait=memory.chord_wait,
+            chord_wait=step.memory.chord_wait,
             carried=last.carried,
         )
+    return eqx.tree_at(lambda done: done.memory, done, memory)
 
-    return by_newton, after
+
+def _begun(step: _Step, state: State, h: Scalar) -> Memory:
+    """The memory of a scheme that begins at a state."""
+    model = step.model
+    return first_memory(step.scheme, model, state, h, *model.accelerations(state))
 
 
 def _at_time(state: State, start: State, passed: Scalar) -> State:

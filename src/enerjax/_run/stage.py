@@ -177,6 +177,28 @@ def solve(
     return _solved(scheme, problem, model, start, memory, prepared, root)
 
 
+def unsolved(
+    scheme: AbstractOneSolveScheme,
+    model: AbstractModel,
+    start: State,
+    h: Scalar,
+    memory: Memory,
+) -> Solved:
+    """A step of which no part is solved: it ends where it starts."""
+    problem = _problem(scheme, model, start, h, memory.carried)
+    z = jax.tree.map(lambda x: x[0], memory.added)
+    like = jax.eval_shape(lambda: scheme.finish(z, problem))
+    end = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+    return Solved(
+        end=eqx.tree_at(lambda end: end.state, end, start),
+        iterations=jnp.array(0),
+        residual=jnp.zeros_like(h),
+        result=RESULTS.successful,
+        roughness=jnp.zeros((3,), h.dtype),
+        memory=memory,
+    )
+
+
 class _Prepared(eqx.Module):
     """The data of a search: scales, guesses and factors. `flight` is a free flight."""
 
