@@ -117,16 +117,68 @@ def test_new_numbers_compile_nothing(scheme, caplog):
         assert not compiled, f"a new {name} compiled {compiled}"
 
 
-def test_the_count_of_compilations_can_fail(caplog):
-    """The other side of the test above: a new number of steps is another program."""
+def compiled_by(run, caplog):
+    """The messages about the programs that a call compiles."""
+    caplog.clear()
+    with jax.log_compiles():
+        run()
+    messages = [record.getMessage() for record in caplog.records]
+    return [message for message in messages if "Compiling" in message]
+
+
+def simulate_pendulum(num_steps, g=9.81, **options):
     system, start, args = problem("pendulum")
-    for num_steps in (3, 4):
-        caplog.clear()
-        with jax.log_compiles():
-            ej.simulate(
-                system, ej.EnergyPreserving(), start, args, h=0.01, num_steps=num_steps
-            )
-    assert any("Compiling" in record.getMessage() for record in caplog.records)
+    args = args | dict(g=g)
+    return ej.simulate(
+        system,
+        ej.EnergyPreserving(),
+        start,
+        args,
+        h=0.01,
+        num_steps=num_steps,
+        **options,
+    )
+
+
+def test_runs_share_a_program_up_to_the_next_power_of_two(caplog):
+    longest = simulate_pendulum(16)
+    simulate_pendulum(14)
+    for num_steps in (9, 11, 13):
+        # What remains is the program that cuts the rows off.
+        names = compiled_by(lambda n=num_steps: simulate_pendulum(n), caplog)
+        assert all("first_rows" in name for name in names), names
+        shorter = simulate_pendulum(num_steps)
+        rows = num_steps + 1
+        assert shorter.result == ej.RESULTS.successful
+        assert int(shorter.stats.completed_steps) == num_steps
+        assert shorter.stats.newton_iterations.shape == (num_steps,)
+        assert shorter.audit.leak.shape == (rows,)
+        # One program: equal to the bit.
+        np.testing.assert_array_equal(shorter.ys.q, longest.ys.q[:rows])
+        np.testing.assert_array_equal(shorter.end.q, longest.ys.q[num_steps])
+    # The count can fail: this number of steps needs another program.
+    assert any(
+        "_run" in name for name in compiled_by(lambda: simulate_pendulum(17), caplog)
+    )
+
+
+def test_rows_of_every_third_step_end_with_the_end():
+    whole = simulate_pendulum(11)
+    some = simulate_pendulum(11, saveat=ej.SaveAt(every=3))
+    np.testing.assert_allclose(some.ts, [0.0, 0.03, 0.06, 0.09, 0.11], rtol=1e-14)
+    # Solver: another program.
+    np.testing.assert_allclose(some.ys.q, whole.ys.q[jnp.array([0, 3, 6, 9, 11])], **SAME)
+
+
+def test_every_kind_of_number_uses_the_same_program(caplog):
+    """`jnp.array(2.0)` has a weak type, which JAX compiles apart if it is kept."""
+    kinds = (2.0, jnp.array(2.0), np.float64(2.0), jnp.asarray(2.0, jnp.float64))
+    last = lambda g: simulate_pendulum(8, g).ys.q[-1, 0]
+    for run in (last, jax.grad(last)):
+        run(1.0)
+        for kind in kinds:
+            names = compiled_by(lambda run=run, kind=kind: run(kind), caplog)
+            assert not any("_run" in name for name in names), (kind, names)
 
 
 def test_the_functions_of_the_user_are_traced_once():

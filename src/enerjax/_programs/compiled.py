@@ -7,6 +7,7 @@ from typing import Any, ParamSpec, TypeVar
 import equinox as eqx
 import jax
 from jax.core import Tracer
+from jaxtyping import PyTree
 
 from .tracing import is_known
 
@@ -31,7 +32,7 @@ def compiled(fn: Callable[Arguments, Value]) -> Callable[Arguments, Value]:
 
     @functools.wraps(fn)
     def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Value:
-        if _is_traced() or not (is_known((args, kwargs)) and _are_known()):
+        if not (at_top_level((args, kwargs)) and _are_known()):
             return within(*args, **kwargs)
         try:
             return alone(*args, **kwargs)
@@ -47,9 +48,10 @@ def compiled(fn: Callable[Arguments, Value]) -> Callable[Arguments, Value]:
 _zero = jax.jit(lambda: 0.0)
 
 
-def _is_traced() -> bool:
-    """Whether a program is being traced that this call will be a part of."""
-    return isinstance(_zero(), Tracer)
+def at_top_level(arguments: PyTree[Any]) -> bool:
+    """Whether a call with these arguments is part of no transformation, as far as can be
+    seen: a function among them may have a traced closure."""
+    return is_known(arguments) and not isinstance(_zero(), Tracer)
 
 
 @functools.cache

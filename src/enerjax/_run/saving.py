@@ -189,6 +189,10 @@ class AbstractSaving(eqx.Module):
         """The number of attempted steps between two states that are kept."""
 
     @abc.abstractmethod
+    def num_rows(self, plan: AbstractPlan) -> int:
+        """The number of rows of a run with this plan."""
+
+    @abc.abstractmethod
     def rows(self, run: RecordedRun) -> Rows:
         """The rows; those that the run did not reach are NaN."""
 
@@ -214,6 +218,9 @@ class _AtBothEnds(AbstractSaving):
     def steps_in_group(self, plan: AbstractPlan) -> int:
         return plan.max_attempts
 
+    def num_rows(self, plan: AbstractPlan) -> int:
+        return 2
+
     def rows(self, run: RecordedRun) -> Rows:
         plan, record = run.plan, run.record
         at_end = record.reached & (record.place >= plan.last)
@@ -228,6 +235,9 @@ class _EveryEqualStep(AbstractSaving):
 
     def steps_in_group(self, plan: AbstractPlan) -> int:
         return self.every
+
+    def num_rows(self, plan: AbstractPlan) -> int:
+        return 1 - (-plan.max_attempts // self.every)
 
     def rows(self, run: RecordedRun) -> Rows:
         plan, record = run.plan, run.record
@@ -246,6 +256,9 @@ class _EveryAcceptedStep(AbstractSaving):
 
     def steps_in_group(self, plan: AbstractPlan) -> int:
         return 1
+
+    def num_rows(self, plan: AbstractPlan) -> int:
+        return 1 - (-plan.max_attempts // self.every)
 
     def rows(self, run: RecordedRun) -> Rows:
         plan, record, completed = run.plan, run.record, run.completed
@@ -273,6 +286,9 @@ class _AtTimes(AbstractSaving):
 
     def steps_in_group(self, plan: AbstractPlan) -> int:
         return 1
+
+    def num_rows(self, plan: AbstractPlan) -> int:
+        return self.times.size
 
     def rows(self, run: RecordedRun) -> Rows:
         plan, record, completed, ts = run.plan, run.record, run.completed, self.times

@@ -1,5 +1,6 @@
 """Whole runs."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -7,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from .._programs import compiled
+from .._programs import at_top_level, compiled
 from .._solvers import Newton, RootFinder
 from .._system import AbstractSystem, State
 from .._types import Args, Real, Scalar
@@ -17,9 +18,9 @@ from .failure import explained_memory_error, raise_failure
 from .inputs import check_halvings, prepare
 from .loop import run_loop, Stepper
 from .saving import AbstractSaving, RecordedRun, SaveAt, SaveFunction, saving_of
-from .solution import Solution, Statistics
+from .solution import first_rows, Solution, Statistics
 from .step import model_for
-from .step_sizes import AbstractController, AbstractPlan, EqualSteps, find_end
+from .step_sizes import AbstractController, AbstractPlan, EqualSteps, find_end, rounded_up
 
 
 def simulate(
@@ -91,19 +92,24 @@ def simulate(
     start, args, step, begin = prepare(system, scheme, start, args, h, t0, root_finder)
     end = find_end(num_steps, t1, max_steps, controller, h, t0, step.dtype)
     plan = controller.plan(scheme, step, begin, end)
+    saving = saving_of(saveat, plan, controller)
     task = _Task(
         system=system,
         scheme=scheme,
         start=start,
         args=args,
         plan=plan,
-        saving=saving_of(saveat, plan, controller),
+        saving=saving,
         fn=saveat.fn,
         root_finder=root_finder,
         max_halvings=max_halvings,
     )
+    if at_top_level(task):
+        task = dataclasses.replace(task, plan=rounded_up(plan))
     with explained_memory_error(plan.max_attempts):
         solution, reached = _run(task)
+    if solution.ts.size > saving.num_rows(plan):
+        solution = first_rows(solution, saving.num_rows(plan))
     if not throw:
         return solution
     equal = plan.unit if isinstance(controller, EqualSteps) else None

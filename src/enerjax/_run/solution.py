@@ -1,11 +1,12 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from .._programs import is_known
+from .._programs import compiled, is_known
 from .._results import RESULTS, tally
 from .._system import State
 from .._types import Count, Scalar
@@ -97,6 +98,32 @@ class Solution(eqx.Module):
 
     def __str__(self) -> str:
         return _report(self) if is_known(self) else repr(self)
+
+
+@compiled
+def first_rows(solution: Solution, count: int) -> Solution:
+    """The solution without the rows after the first `count` rows."""
+
+    def cut(tree: PyTree[Any], count: int) -> PyTree[Any]:
+        return jax.tree.map(lambda x: x[:count], tree)
+
+    stats = solution.stats
+    per_row = lambda stats: (
+        stats.newton_iterations,
+        stats.residual,
+        stats.halvings,
+        stats.local_error,
+    )
+    return Solution(
+        ts=cut(solution.ts, count),
+        ys=cut(solution.ys, count),
+        multipliers=cut(solution.multipliers, count),
+        details=cut(solution.details, count - 1),
+        audit=cut(solution.audit, count),
+        stats=eqx.tree_at(per_row, stats, cut(per_row(stats), count - 1)),
+        end=solution.end,
+        result=solution.result,
+    )
 
 
 def _report(solution: Solution) -> str:

@@ -1,6 +1,7 @@
 """The interface of step controllers, and steps of equal length."""
 
 import abc
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -183,6 +184,18 @@ class _EqualPlan(AbstractPlan):
 
     def num_rejected(self, memory: None) -> None:
         return None
+
+
+def rounded_up(plan: AbstractPlan) -> AbstractPlan:
+    """The plan with room for the next power of two of equal steps.
+
+    Runs of similar lengths then share one program. Steps that are not needed cost next to
+    nothing.
+    """
+    if not isinstance(plan, _EqualPlan):
+        return plan
+    room = 1 << (plan.max_attempts - 1).bit_length()
+    return dataclasses.replace(plan, max_attempts=room, is_counted=False)
 
 
 def find_end(

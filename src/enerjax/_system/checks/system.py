@@ -103,7 +103,13 @@ def _check_precision(args: Args, dtype: Any) -> None:
 
 
 def _as_array(x: Any, dtype: Any) -> Any:
-    """Python floats become arrays, because each new Python float would recompile."""
+    """Python floats become arrays, because each new Python float would recompile.
+
+    The array of a Python float, such as `jnp.array(2.0)`, remembers where it comes from
+    (its type is weak). It becomes an ordinary one, because each kind would recompile too.
+    """
     if isinstance(x, float | np.floating):
         return jnp.asarray(x, dtype)
+    if isinstance(x, jax.Array) and jax.typeof(x).weak_type:
+        return jnp.asarray(x, x.dtype)
     return jnp.asarray(x) if isinstance(x, np.ndarray) else x
