@@ -17,7 +17,6 @@ from pathlib import Path
 
 import harness
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import enerjax as ej
@@ -56,14 +55,12 @@ def last_body(q: jax.Array) -> np.ndarray:
 
 
 def our_rows(quick: bool) -> list[harness.Row]:
-    rows, programs = [], []
+    rows, right_runs = [], []
     for num_bodies in sizes(quick):
-        system, start, args = scene(num_bodies).build()
+        mechanism = system, start, args = scene(num_bodies).build()
         steps = STEPS[num_bodies]
         begin = time.perf_counter()
-        run = harness.run_of(system, ej.EnergyPreserving(), steps)
-        program, seconds = harness.compiled(run, start, args, H)
-        solution = program(start, args, H)
+        run = harness.compiled_run(mechanism, ej.EnergyPreserving(), H, steps)
         first_call = time.perf_counter() - begin
         half = ej.simulate(
             system,
@@ -74,32 +71,31 @@ def our_rows(quick: bool) -> list[harness.Row]:
             num_steps=2 * steps,
             saveat=ej.SaveAt(t1=True),
         )
-        end = last_body(solution.ys.q[-1])
+        end = last_body(run.solution.ys.q[-1])
+        energy, level, rate = run.residuals()
         fall = 9.81 * num_bodies**2 / 2
         row: harness.Row = dict(
             work=num_bodies,
             method="EnergyPreserving()",
             steps=steps,
-            compile_s=seconds,
+            compile_s=run.compile_s,
             first_call_s=first_call,
-            corrections=float(jnp.sum(solution.stats.newton_iterations)) / steps,
-            energy=float(jnp.ptp(solution.audit.energy)) / fall,
-            level=float(jnp.max(jnp.abs(solution.audit.constraint))),
-            rate=float(jnp.max(jnp.abs(solution.audit.constraint_rate))),
+            corrections=run.corrections(),
+            energy=energy / fall,
+            level=level,
+            rate=rate,
             error=float(np.max(np.abs(end - last_body(half.end.q)))) / num_bodies,
             end=end.tolist(),
         )
         right = row["energy"] <= ENERGY_BOUND and row["error"] <= ERROR_BOUND
         right = right and max(row["level"], row["rate"]) <= LEVEL_BOUND * num_bodies
         if right:
-            programs.append(lambda p=program, x=(start, args, H): p(*x))
+            right_runs.append((row, run))
         else:
             print(f"N = {num_bodies} is wrong: {row}; not timed")
         row["timed"] = right
         rows.append(row)
-    timed = [row for row in rows if row["timed"]]
-    for row, seconds in zip(timed, harness.medians(programs, 5), strict=True):
-        row["us_per_step"] = 1e6 * seconds / row["steps"]
+    harness.add_step_times(right_runs, 5)
     return [row | harness.device() for row in rows]
 
 

@@ -62,44 +62,42 @@ def sizes(quick: bool) -> tuple[int, ...]:
 
 
 def our_rows(quick: bool) -> list[harness.Row]:
-    rows, programs = [], []
+    rows, right_runs = [], []
     for num_links in sizes(quick):
-        system, start, args = ej.problems.chain(num_links)
+        problem = ej.problems.chain(num_links)
         steps = STEPS[num_links]
-        run = harness.run_of(system, ej.EnergyPreserving(), steps)
-        program, seconds = harness.compiled(run, start, args, H)
-        solution = program(start, args, H)
+        run = harness.compiled_run(problem, ej.EnergyPreserving(), H, steps)
+        args = problem.args
         turnover = float(jnp.sum(args["m"] * args["g"] * jnp.cumsum(args["l"])))
         length = 1 / num_links
+        energy, level, rate = run.residuals()
         row: harness.Row = dict(
             work=num_links,
             method="EnergyPreserving()",
             steps=steps,
-            compile_s=seconds,
-            corrections=float(jnp.sum(solution.stats.newton_iterations)) / steps,
-            energy=float(jnp.ptp(solution.audit.energy)) / turnover,
-            level=float(jnp.max(jnp.abs(solution.audit.constraint))) / length**2,
-            rate=float(jnp.max(jnp.abs(solution.audit.constraint_rate)))
-            / (length * 9.81 * steps * H),
+            compile_s=run.compile_s,
+            corrections=run.corrections(),
+            energy=energy / turnover,
+            level=level / length**2,
+            rate=rate / (length * 9.81 * steps * H),
         )
         error = np.nan
         if num_links <= WITH_REFERENCE:
             exact = reference(num_links, steps * H)
-            error = float(np.max(np.abs(solution.ys.q[-1] - exact)))
+            error = float(np.max(np.abs(run.solution.ys.q[-1] - exact)))
         row["error"] = error
         right = row["energy"] <= ENERGY_BOUND and not error > ERROR_BOUND
         right = right and max(row["level"], row["rate"]) <= LEVEL_BOUND
         if right:
-            memory = program.memory_analysis()
+            memory = run.program.memory_analysis()
             row["bytes_per_link"] = memory.temp_size_in_bytes / num_links
-            programs.append(lambda p=program, x=(start, args, H): p(*x))
+            right_runs.append((row, run))
         else:
             print(f"N = {num_links} is wrong: {row}; not timed")
         row["timed"] = right
         rows.append(row)
-    timed = [row for row in rows if row["timed"]]
-    for row, seconds in zip(timed, harness.medians(programs, 5), strict=True):
-        row["us_per_step"] = 1e6 * seconds / row["steps"]
+    harness.add_step_times(right_runs, 5)
+    for row, _ in right_runs:
         row["us_per_correction"] = row["us_per_step"] / row["corrections"]
     return [row | harness.device() for row in rows]
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 import enerjax as ej
 
@@ -165,6 +166,55 @@ def run_of(
         return ej.simulate(*mechanism, h=h, num_steps=steps, saveat=saveat, throw=False)
 
     return run
+
+
+@dataclasses.dataclass(frozen=True)
+class CompiledRun:
+    """A compiled run of `steps` steps, and the solution of its first execution.
+
+    `program` is a function of `inputs`, and took `compile_s` seconds to compile.
+    """
+
+    program: Any
+    inputs: tuple[ej.State, Any, float]
+    steps: int
+    compile_s: float
+    solution: ej.Solution
+
+    def again(self) -> ej.Solution:
+        return self.program(*self.inputs)
+
+    def corrections(self) -> float:
+        """The Newton corrections of a step, on average."""
+        return float(np.sum(self.solution.stats.newton_iterations)) / self.steps
+
+    def residuals(self) -> tuple[float, float, float]:
+        """The largest difference of energies, and the largest residuals of the constraints
+        at position and velocity level."""
+        audit = self.solution.audit
+        levels = (audit.constraint, audit.constraint_rate)
+        level, rate = (float(np.max(np.abs(x))) for x in levels)
+        return float(np.ptp(audit.energy)), level, rate
+
+
+def compiled_run(
+    problem: tuple[ej.AbstractSystem, ej.State, Any],
+    scheme: ej.AbstractScheme,
+    h: float,
+    steps: int,
+) -> CompiledRun:
+    """Compiles a run, which is saved at its end, and executes it once."""
+    system, start, args = problem
+    inputs = (start, args, h)
+    program, seconds = compiled(run_of(system, scheme, steps), *inputs)
+    return CompiledRun(program, inputs, steps, seconds, program(*inputs))
+
+
+def add_step_times(runs: Sequence[tuple[Row, CompiledRun]], repeats: int) -> None:
+    """Adds the time of a step in microseconds to the row of each run."""
+    times = medians([run.again for _, run in runs], repeats)
+    for (row, run), seconds in zip(runs, times, strict=True):
+        row[_TIME] = 1e6 * seconds / run.steps
 
 
 def medians(programs: Sequence[Callable[[], Any]], repeats: int) -> list[float]:

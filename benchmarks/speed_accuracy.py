@@ -65,16 +65,13 @@ def our_rows(quick: bool, names: Sequence[str]) -> list[harness.Row]:
 def _our_run(
     name: str, work: Work, label: str, scheme: ej.AbstractScheme, h: float, exact: Any
 ) -> tuple[harness.Row, Callable | None]:
-    system, start, args = work.problem()
-    steps = round(work.end / h)
-    run = harness.run_of(system, scheme, steps)
-    program, _ = harness.compiled(run, start, args, h)
-    solution = program(start, args, h)
+    run = harness.compiled_run(work.problem(), scheme, h, round(work.end / h))
+    solution = run.solution
     error = work.error(work.positions(np.asarray(solution.ys.q[-1])), exact)
     error = error if np.isfinite(error) else float("inf")
     row = dict(work=name, kind="ours", solver=label, setting=f"h {h:g}", error=error)
     row["energy"] = float(abs(solution.audit.leak[-1]))
-    return row, (lambda: program(start, args, h)) if error <= BOUND else None
+    return row, run.again if error <= BOUND else None
 
 
 def _chosen(quick: bool, names: Sequence[str]) -> dict[str, Work]:

@@ -11,7 +11,6 @@ coordinates. Writes step_cost.json and step_cost.png.
 """
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 
 import harness
@@ -73,32 +72,26 @@ def problem_of(work: str) -> ej.problems.Problem:
 
 def our_rows(quick: bool) -> list[harness.Row]:
     exact = reference()
-    rows: list[harness.Row] = []
-    programs: list[Callable] = []
+    rows, right_runs = [], []
     for work, table, end in (("pendulum", PENDULUM, PENDULUM_END), ("top", TOP, TOP_END)):
-        system, start, args = problem_of(work)
+        problem = problem_of(work)
         for name, h, bound in table:
             steps = round(end / h)
-            run = harness.run_of(system, scheme_of(name), steps)
-            program, seconds = harness.compiled(run, start, args, h)
-            solution = program(start, args, h)
+            run = harness.compiled_run(problem, scheme_of(name), h, steps)
+            solution = run.solution
             position = np.asarray(solution.ys.q[-1])[: len(exact[work])]
             error = float(np.max(np.abs(position - exact[work])))
             energy = solution.audit.energy
             leak = float(abs(energy[-1] - energy[0] + solution.audit.dissipated[-1]))
             row = dict(work=work, method=name, h=h, error=error, energy=leak)
             if error <= bound:
-                row |= dict(steps=steps, compile_s=seconds)
-                iterations = solution.stats.newton_iterations
-                row["iterations"] = float(np.sum(iterations)) / steps
-                programs.append(lambda p=program, x=(start, args, h): p(*x))
+                row |= dict(steps=steps, compile_s=run.compile_s)
+                row["iterations"] = run.corrections()
+                right_runs.append((row, run))
             else:
                 print(f"{name} on the {work} is off by {error:.1e}: not timed")
             rows.append(row)
-    timed = [row for row in rows if "steps" in row]
-    times = harness.medians(programs, QUICK_REPEATS if quick else REPEATS)
-    for row, seconds in zip(timed, times, strict=True):
-        row["us_per_step"] = 1e6 * seconds / row["steps"]
+    harness.add_step_times(right_runs, QUICK_REPEATS if quick else REPEATS)
     return [row | harness.device() for row in rows]
 
 
