@@ -78,12 +78,9 @@ def accelerations(q: jax.Array, v: jax.Array, m: jax.Array) -> jax.Array:
 
 
 def diffrax_run(steps: int) -> Callable | None:
-    try:
-        import diffrax  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        print("diffrax is not installed (extra `peers`): no rows to compare with")
+    diffrax = harness.peer("diffrax", "diffrax")
+    if diffrax is None:
         return None
-
     start = problem().start
 
     def rates(t, y, m):
@@ -103,7 +100,6 @@ def diffrax_run(steps: int) -> Callable | None:
             # The last step may fall a rounding error short of the end.
             max_steps=steps + 2,
         )
-        assert solution.ys is not None
         return solution.ys[-1, :4], solution.ys[-1, 4:], jnp.zeros(())
 
     return run

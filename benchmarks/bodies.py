@@ -100,14 +100,12 @@ def our_rows(quick: bool) -> list[harness.Row]:
 
 
 def exudyn_rows(quick: bool) -> list[harness.Row]:
-    try:
-        from bodies_exudyn import run
-    except ImportError:
-        print("EXUDYN is not installed (extra `peers`): no rows to compare with")
+    exudyn = harness.peer("bodies_exudyn", "EXUDYN")
+    if exudyn is None:
         return []
     rows = []
     for n in sizes(quick):
-        us_per_step, end = run(n, INERTIA, H, STEPS[n])
+        us_per_step, end = exudyn.run(n, INERTIA, H, STEPS[n])
         rows.append(
             dict(
                 work=n,

@@ -103,10 +103,8 @@ def our_rows(quick: bool) -> list[harness.Row]:
 
 
 def exudyn_rows(quick: bool) -> list[harness.Row]:
-    try:
-        from chain_exudyn import us_per_step
-    except ImportError:
-        print("EXUDYN is not installed (extra `peers`): no rows to compare with")
+    exudyn = harness.peer("chain_exudyn", "EXUDYN")
+    if exudyn is None:
         return []
     return [
         dict(
@@ -114,7 +112,7 @@ def exudyn_rows(quick: bool) -> list[harness.Row]:
             method="EXUDYN generalized-alpha, rho 0.5",
             mode="exudyn",
             steps=STEPS[n],
-            us_per_step=us_per_step(n, H, STEPS[n]),
+            us_per_step=exudyn.us_per_step(n, H, STEPS[n]),
         )
         for n in sizes(quick)
         if n <= 2000

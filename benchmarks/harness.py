@@ -7,6 +7,7 @@ its settings only once; the child prints its rows as the last line of its output
 import argparse
 import csv
 import dataclasses
+import importlib
 import json
 import os
 import statistics
@@ -215,6 +216,15 @@ def add_step_times(runs: Sequence[tuple[Row, CompiledRun]], repeats: int) -> Non
     times = medians([run.again for _, run in runs], repeats)
     for (row, run), seconds in zip(runs, times, strict=True):
         row[_TIME] = 1e6 * seconds / run.steps
+
+
+def peer(module: str, program: str) -> Any:
+    """A module that needs another program, or without this program `None` and a message."""
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        print(f"{program} is not installed (extra `peers`): no rows to compare with")
+        return None
 
 
 def medians(programs: Sequence[Callable[[], Any]], repeats: int) -> list[float]:

@@ -97,13 +97,11 @@ def our_rows(quick: bool) -> list[harness.Row]:
 
 def exudyn_rows(quick: bool) -> list[harness.Row]:
     """The same work by EXUDYN, or no rows if it is not installed."""
-    try:
-        import step_cost_exudyn
-    except ImportError:
-        print("EXUDYN is not installed (extra `peers`): no rows to compare with")
+    exudyn = harness.peer("step_cost_exudyn", "EXUDYN")
+    if exudyn is None:
         return []
     repeats = QUICK_REPEATS if quick else REPEATS
-    rows = step_cost_exudyn.rows(reference(), PENDULUM_END, TOP_END, repeats)
+    rows = exudyn.rows(reference(), PENDULUM_END, TOP_END, repeats)
     return [row | dict(mode="exudyn") for row in rows]
 
 
