@@ -2,16 +2,10 @@
 
 # pyright: reportArgumentType=false, reportMissingImports=false
 
-import statistics
-import sys
-import time
+import functools
 
-
-sys.exudynFast = True  # pyright: ignore[reportAttributeAccessIssue]
-
-import exudyn as exu  # noqa: E402
-import exudyn.utilities as eu  # noqa: E402
-import numpy as np  # noqa: E402
+import numpy as np
+from exudyn_runs import eu, exu, settings_of, timed
 
 
 def _build(num_bodies: int, inertia: np.ndarray):
@@ -39,28 +33,12 @@ def _build(num_bodies: int, inertia: np.ndarray):
         )
         last = at(0.5)
     system.Assemble()
-    return container, system, node
+    read = lambda: system.GetNodeOutput(node, exu.OutputVariableType.Position)
+    return container, system, read
 
 
 def run(num_bodies: int, inertia: np.ndarray, h: float, steps: int, repeats: int = 3):
     """The time of a step in microseconds, and the last mass centre at the end."""
-    settings = exu.SimulationSettings()
-    settings.timeIntegration.numberOfSteps = steps
-    settings.timeIntegration.endTime = steps * h
-    settings.timeIntegration.verboseMode = 0
-    settings.timeIntegration.generalizedAlpha.spectralRadius = 0.9
-    settings.solution.file.write = False
-    kinds = exu.LinearSolverType
-    settings.linearSolver.solverType = (
-        kinds.EigenSparse if num_bodies > 3 else kinds.EXUdense
-    )
-    settings.parallel.numberOfThreads = 1
-    times, end = [], np.zeros(3)
-    for _ in range(repeats):
-        container, system, node = _build(num_bodies, inertia)
-        begin = time.perf_counter()
-        system.SolveDynamic(settings, solverType=exu.DynamicSolverType.GeneralizedAlpha)
-        times.append(time.perf_counter() - begin)
-        end = np.asarray(system.GetNodeOutput(node, exu.OutputVariableType.Position))
-        del container
-    return 1e6 * statistics.median(times) / steps, end
+    build = functools.partial(_build, num_bodies, inertia)
+    settings = settings_of(h, steps, 0.9, is_sparse=num_bodies > 3)
+    return timed(build, settings, repeats)

@@ -2,20 +2,15 @@
 
 # pyright: reportArgumentType=false, reportMissingImports=false
 
-import statistics
-import sys
-import time
 from collections.abc import Callable, Sequence
 
-
-sys.exudynFast = True  # pyright: ignore[reportAttributeAccessIssue]
-
-import exudyn as exu  # noqa: E402
-import exudyn.utilities as eu  # noqa: E402
-import numpy as np  # noqa: E402
+import numpy as np
+from exudyn_runs import eu, exu, settings_of, timed
 
 
-def _build(masses: Sequence[float], length: float):
+def chain(masses: Sequence[float], length: float):
+    """The container, the system, and a function that reads the positions of the nodes, or
+    another output of them."""
     container = exu.SystemContainer()
     system = container.AddSystem()
     ground = system.AddObject(eu.ObjectGround())
@@ -31,20 +26,10 @@ def _build(masses: Sequence[float], length: float):
         system.AddObject(eu.DistanceConstraint(markerNumbers=ends, distance=length))
         last = marker
     system.Assemble()
-    return container, system, nodes
-
-
-def _settings(h: float, steps: int, rho: float, is_sparse: bool):
-    settings = exu.SimulationSettings()
-    settings.timeIntegration.numberOfSteps = steps
-    settings.timeIntegration.endTime = steps * h
-    settings.timeIntegration.verboseMode = 0
-    settings.timeIntegration.generalizedAlpha.spectralRadius = rho
-    settings.solution.file.write = False
-    kinds = exu.LinearSolverType
-    settings.linearSolver.solverType = kinds.EigenSparse if is_sparse else kinds.EXUdense
-    settings.parallel.numberOfThreads = 1
-    return settings
+    read = lambda kind=exu.OutputVariableType.Position: np.concatenate(
+        [system.GetNodeOutput(node, kind)[:2] for node in nodes]
+    )
+    return container, system, read
 
 
 def prepared(
@@ -58,16 +43,13 @@ def prepared(
 
     With the generalized-alpha method, or without `rho` the trapezoidal rule of index 2.
     """
-    container, system, nodes = _build(masses, length)
-    settings = _settings(h, round(end / h), rho or 1.0, len(masses) > 8)
+    container, system, read = chain(masses, length)
+    settings = settings_of(h, round(end / h), rho or 1.0, is_sparse=len(masses) > 8)
     kinds = exu.DynamicSolverType
     solver = kinds.TrapezoidalIndex2 if rho is None else kinds.GeneralizedAlpha
 
     def run(container=container) -> tuple[np.ndarray, np.ndarray]:
         system.SolveDynamic(settings, solverType=solver)
-        read = lambda kind: np.concatenate(
-            [system.GetNodeOutput(n, kind)[:2] for n in nodes]
-        )
         kinds = exu.OutputVariableType
         return read(kinds.Position), read(kinds.Velocity)
 
@@ -75,12 +57,6 @@ def prepared(
 
 
 def us_per_step(num_links: int, h: float, steps: int, repeats: int = 3) -> float:
-    settings = _settings(h, steps, 0.5, True)
-    times = []
-    for _ in range(repeats):
-        container, system, _ = _build([1 / num_links] * num_links, 1 / num_links)
-        begin = time.perf_counter()
-        system.SolveDynamic(settings, solverType=exu.DynamicSolverType.GeneralizedAlpha)
-        times.append(time.perf_counter() - begin)
-        del container
-    return 1e6 * statistics.median(times) / steps
+    build = lambda: chain([1 / num_links] * num_links, 1 / num_links)
+    settings = settings_of(h, steps, 0.5, is_sparse=True)
+    return timed(build, settings, repeats)[0]

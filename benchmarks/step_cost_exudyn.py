@@ -2,37 +2,12 @@
 
 # pyright: reportArgumentType=false, reportMissingImports=false
 
-import statistics
-import sys
 import time
 from collections.abc import Callable
 
-
-sys.exudynFast = True  # pyright: ignore[reportAttributeAccessIssue]
-
-import exudyn as exu  # noqa: E402
-import exudyn.utilities as eu  # noqa: E402
-import numpy as np  # noqa: E402
-
-
-def _pendulum():
-    container = exu.SystemContainer()
-    system = container.AddSystem()
-    ground = system.AddObject(eu.ObjectGround())
-    last = system.AddMarker(eu.MarkerBodyPosition(bodyNumber=ground))
-    nodes = []
-    for k in (1, 2):
-        nodes.append(system.AddNode(eu.NodePoint2D(referenceCoordinates=[k, 0])))
-        body = system.AddObject(eu.MassPoint2D(mass=1.0, nodeNumber=nodes[-1]))
-        marker = system.AddMarker(eu.MarkerBodyPosition(bodyNumber=body))
-        system.AddLoad(eu.Force(markerNumber=marker, loadVector=[0, 9.81, 0]))
-        ends = [last, marker]
-        system.AddObject(eu.DistanceConstraint(markerNumbers=ends, distance=1.0))
-        last = marker
-    system.Assemble()
-    position = exu.OutputVariableType.Position
-    end = lambda: np.concatenate([system.GetNodeOutput(n, position)[:2] for n in nodes])
-    return container, system, end
+import numpy as np
+from chain_exudyn import chain
+from exudyn_runs import eu, exu, settings_of, timed
 
 
 def _top():
@@ -68,7 +43,7 @@ def prepared_top(h: float, end: float) -> Callable[[], tuple[np.ndarray, ...]]:
     Position, velocity, and angular velocity in axes of the body.
     """
     container, system, read = _top()
-    settings = _settings(h, round(end / h))
+    settings = settings_of(h, round(end / h), 0.9, is_sparse=False)
 
     def run(container=container) -> tuple[np.ndarray, ...]:
         system.SolveDynamic(settings, solverType=exu.DynamicSolverType.GeneralizedAlpha)
@@ -79,46 +54,28 @@ def prepared_top(h: float, end: float) -> Callable[[], tuple[np.ndarray, ...]]:
     return run
 
 
-def _settings(h: float, steps: int):
-    settings = exu.SimulationSettings()
-    settings.timeIntegration.numberOfSteps = steps
-    settings.timeIntegration.endTime = steps * h
-    settings.timeIntegration.verboseMode = 0
-    settings.timeIntegration.generalizedAlpha.spectralRadius = 0.9
-    settings.solution.file.write = False
-    settings.linearSolver.solverType = exu.LinearSolverType.EXUdense
-    settings.parallel.numberOfThreads = 1
-    return settings
-
-
 def _row(
     work: str, build: Callable, h: float, end: float, exact: np.ndarray, repeats: int
 ) -> dict:
     steps = round(end / h)
-    settings = _settings(h, steps)
-    times, error = [], np.inf
-    for _ in range(repeats):
-        container, system, position = build()
-        begin = time.process_time()
-        system.SolveDynamic(settings, solverType=exu.DynamicSolverType.GeneralizedAlpha)
-        times.append(time.process_time() - begin)
-        error = float(np.max(np.abs(position() - exact)))
-        del container
+    settings = settings_of(h, steps, 0.9, is_sparse=False)
+    us_per_step, position = timed(build, settings, repeats, time.process_time)
     return dict(
         work=work,
         method="generalized-alpha, rho 0.9",
         h=h,
-        error=error,
+        error=float(np.max(np.abs(position - exact))),
         energy=float("nan"),
         steps=steps,
-        us_per_step=1e6 * statistics.median(times) / steps,
+        us_per_step=us_per_step,
     )
 
 
 def rows(
     exact: dict[str, np.ndarray], pendulum_end: float, top_end: float, repeats: int
 ) -> list[dict]:
+    pendulum = lambda: chain((1.0, 1.0), 1.0)
     return [
-        _row("pendulum", _pendulum, 1e-3, pendulum_end, exact["pendulum"], repeats),
+        _row("pendulum", pendulum, 1e-3, pendulum_end, exact["pendulum"], repeats),
         _row("top", _top, 1e-3, top_end, exact["top"], repeats),
     ]
