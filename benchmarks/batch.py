@@ -12,7 +12,6 @@ settings and with `enable_fast_loops()` (two processes) on one core, or on the G
 finds. Writes batch.json and batch.png.
 """
 
-import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -118,13 +117,10 @@ def energies(q: np.ndarray, v: np.ndarray, m: np.ndarray) -> np.ndarray:
 
 def reference(m: np.ndarray, end: float) -> np.ndarray:
     """Positions of a lane at its end."""
-    from references import DOUBLE_PENDULUM, solve
+    from references import solve, STRETCHED_DOUBLE_PENDULUM
 
-    stretched = dataclasses.replace(
-        DOUBLE_PENDULUM, start=lambda args: np.array([np.pi / 2, np.pi / 2, 0, 0])
-    )
     args = dict(m1=m[0], m2=m[1], l1=1.0, l2=1.0, g=G)
-    return solve(stretched, args, np.array([end])).q[-1]
+    return solve(STRETCHED_DOUBLE_PENDULUM, args, np.array([end])).q[-1]
 
 
 def lane_alone(steps: int = 1000, count: int = 64, lane: int = 7) -> harness.Row:

@@ -160,6 +160,9 @@ PENDULUM = Minimal(_horizontal, _swing, lambda y, args: _end_of_rod(y[0], y[1], 
 DOUBLE_PENDULUM = Minimal(
     lambda args: np.array([math.pi / 2, 0.0, 0.0, 0.0]), _double_swing, _double_state
 )
+STRETCHED_DOUBLE_PENDULUM = dataclasses.replace(
+    DOUBLE_PENDULUM, start=lambda args: np.array([math.pi / 2, math.pi / 2, 0.0, 0.0])
+)
 SPRING_PENDULUM = Minimal(
     lambda args: np.array([args["l"], 0.0, 0.0, 0.0]),
     _spring,
