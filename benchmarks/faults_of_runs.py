@@ -199,8 +199,8 @@ FAULTS = (
     Fault(
         "halving: a stale time",
         "_run/halving.py",
-        "_at_time(sofar.end.state, start, k * length)",
-        "_at_time(sofar.end.state, start, 0 * k * length)",
+        "_at_time(sofar.end.state, self.start, k * length)",
+        "_at_time(sofar.end.state, self.start, 0 * k * length)",
         "The parts of a divided step all begin at the time of the whole step.",
         of("halvings"),
     ),

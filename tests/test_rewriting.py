@@ -18,10 +18,26 @@ X = jnp.sin(jnp.arange(1.0, 13.0)).reshape(3, 4)
 TWICE = np.array([2, 0, 2, 2])
 ROWS, COLUMNS = np.array([[0], [2]]), np.array([[3, 1], [0, 3]])
 OUTSIDE = np.array([-1, 7, 1, 4])
+MANY = np.array([0, 1, 0, 0, 2] * 4)
 
 
 def matrices(x, y, subscripts):
     return jnp.einsum(subscripts, jnp.tile(x, (4, 3)), jnp.tile(y, (4, 3)))
+
+
+def large(x):
+    return jnp.tile(jnp.sin(x), (70, 11))[:, None] * jnp.ones((1, 2, 1), x.dtype)
+
+
+SUMS = (
+    lambda x, axis: jnp.sum(1e-3 * x, axis),
+    jnp.max,
+    jnp.min,
+    lambda x, axis: jnp.prod(1 + 1e-3 * x, axis),
+    lambda x, axis: jnp.all(x > -0.5, axis).astype(x.dtype),
+    lambda x, axis: jnp.any(x > 0.9, axis).astype(x.dtype),
+)
+AXES = (None, 0, 1, (0, 2), 2)
 
 
 def every_place(x):
@@ -51,12 +67,14 @@ IN_OTHER_WORDS = {
     "put": lambda x: x.at[ROWS, COLUMNS].set(jnp.cos(x[:2, :2])),
     "put twice": lambda x: x.at[:, TWICE].set(1 + 0 * x),
     "add twice": lambda x: x.at[:, TWICE].add(jnp.cos(x)),
+    "add many times": lambda x: x.at[0, MANY].add(jnp.sin(jnp.tile(x[1], 10)[: MANY.size])),
     "rows": lambda x: x.at[jnp.array([2, 0])].add(jnp.cos(x[:2])),
     "windows": lambda x: x.at[1:, 1:3].add(x[:2, :2]).at[0].set(2.0),
     "outside": lambda x: x.at[0, OUTSIDE].add(x[1]).at[2, OUTSIDE].set(x[1], mode="drop"),
     "clipped": lambda x: x.at[0, OUTSIDE].add(x[1], mode="clip"),
     "whole numbers": lambda x: x[0].astype(int).at[TWICE].add(3),
     "places": every_place,
+    "long sums": lambda x: [f(large(x), axis) for f in SUMS for axis in AXES],
     "nothing": lambda x: (2 * x).at[np.zeros(0, int)].add(1.0),
     "slope": jax.grad(lambda x: jnp.sum(jnp.sin(x[:, TWICE] * x) ** 2)),
     "curvature": jax.hessian(lambda x: jnp.sum(jnp.sin(x[ROWS, COLUMNS]) ** 3)),

@@ -50,6 +50,7 @@ from ._system import (
     System as System,
 )
 from ._tools.diffrax import IndexReduced as IndexReduced, to_diffrax as to_diffrax
+from ._tools.explain import explain as explain, Explanation as Explanation
 from ._tools.identify import Fit as Fit, fit as fit, MultipleShooting as MultipleShooting
 from ._tools.measure import (
     order_table as order_table,

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
+from jax.extend import source_info_util
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from .primitives import CALLS, JIT, WITH_OWN_DERIVATIVE
@@ -33,7 +34,9 @@ def interpret(
         return known[atom]
 
     for eqn in jaxpr.eqns:
-        outs = equation(eqn, list(map(read, eqn.invars)))
+        # The new equation comes from the same line as the one that it stands for.
+        with source_info_util.user_context(eqn.source_info.traceback):
+            outs = equation(eqn, list(map(read, eqn.invars)))
         known.update(zip(eqn.outvars, outs, strict=True))
     return list(map(read, jaxpr.outvars))
 

@@ -102,9 +102,9 @@ def first_memory(
     carried = None
     if isinstance(scheme, AbstractSchemeWithMemory):
         carried = scheme.begin(model, start, h, acceleration)
-    problem = _problem(scheme, model, start, h, carried)
+    problem = step_problem(scheme, model, start, h, carried)
     z = scheme.predict(problem, acceleration, multipliers)
-    flight = _free_flight(scheme, problem, model, start)
+    flight = free_flight(scheme, problem, model, start)
     added = jax.tree.map(lambda x, x0: jnp.stack([x - x0] * 3), z, flight)
     added = jax.lax.stop_gradient(added)
     flat, _ = ravel_pytree(flight)
@@ -123,7 +123,7 @@ def first_memory(
     )
 
 
-def _problem(
+def step_problem(
     scheme: AbstractOneSolveScheme,
     model: AbstractModel,
     start: State,
@@ -149,7 +149,7 @@ def solve(
     rarely: bool = False,
 ) -> Solved:
     """Solves a step of length `h`. With `skip` it makes no iteration; see `find_root`."""
-    problem = _problem(scheme, model, start, h, memory.carried)
+    problem = step_problem(scheme, model, start, h, memory.carried)
     prepared = _prepared(scheme, problem, model, start, h, memory)
     unknown_scale, row_scale = prepared.unknown_scale, prepared.row_scale
 
@@ -185,7 +185,7 @@ def unsolved(
     memory: Memory,
 ) -> Solved:
     """A step of which no part is solved: it ends where it starts."""
-    problem = _problem(scheme, model, start, h, memory.carried)
+    problem = step_problem(scheme, model, start, h, memory.carried)
     z = jax.tree.map(lambda x: x[0], memory.added)
     like = jax.eval_shape(lambda: scheme.finish(z, problem))
     end = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
@@ -219,7 +219,7 @@ def _prepared(
     h: Scalar,
     memory: Memory,
 ) -> _Prepared:
-    flight = _free_flight(scheme, problem, model, start)
+    flight = free_flight(scheme, problem, model, start)
     unknown_scale, row_scale, least = scales_like(flight, model, start, h)
     scaled = lambda z: jax.tree.map(jnp.divide, z, unknown_scale)
     return _Prepared(
@@ -390,7 +390,7 @@ def _regularisation(model: AbstractModel, unknown_scale: Any, row_scale: Any) ->
     return _with_multipliers(none, jax.tree.map(weighted, unknown_scale, row_scale))
 
 
-def _free_flight(
+def free_flight(
     scheme: AbstractOneSolveScheme, problem: Any, model: AbstractModel, start: State
 ) -> PyTree[Any]:
     """The unknowns of a step without forces and multipliers."""

@@ -28,6 +28,7 @@ from .linear.independent_blocks import (
 from .linear.jacobian import (
     affine_root as affine_root,
     kept_factors as kept_factors,
+    linearisable as linearisable,
     RowPattern as RowPattern,
 )
 from .linear.norms import largest as largest
@@ -46,4 +47,9 @@ from .linear.user_solver import (
 from .newton import Newton as Newton
 from .newton_iterations import max_norm as max_norm
 from .root import find_root as find_root, ROOT as ROOT
-from .root_search import Chord as Chord, Root as Root, RootFinder as RootFinder
+from .root_search import (
+    Chord as Chord,
+    flattened as flattened,
+    Root as Root,
+    RootFinder as RootFinder,
+)

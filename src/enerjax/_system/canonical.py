@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._solvers import inverse, solve
 from .._types import Args, Coordinates, Scalar, Velocities
 from .base import (
     AbstractSystem,
@@ -83,7 +84,7 @@ class LagrangianSystem(AbstractCanonicalSystem):
         return jax.grad(self.kinetic, argnums=1)(state.q, state.v, args)
 
     def velocity(self, q: Coordinates, p: Coordinates, args: Args) -> Velocities:
-        return jnp.linalg.solve(self.inertia(State(q, p), args), p)
+        return solve(self.inertia(State(q, p), args), p)
 
 
 class HamiltonianSystem(AbstractCanonicalSystem):
@@ -111,7 +112,7 @@ class HamiltonianSystem(AbstractCanonicalSystem):
         return self.hamiltonian(state.q, state.v, args)
 
     def inertia(self, state: State, args: Args) -> Float[Array, "nq nq"]:
-        return jnp.linalg.inv(self._inverse_inertia(state.q, state.v, args))
+        return inverse(self._inverse_inertia(state.q, state.v, args))
 
     def _inverse_inertia(self, q: Coordinates, p: Coordinates, args: Args) -> Array:
         return jax.hessian(self.hamiltonian, argnums=1)(q, p, args)

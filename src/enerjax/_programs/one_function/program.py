@@ -13,7 +13,7 @@ from jax.interpreters.partial_eval import dce_jaxpr_consts
 from jaxtyping import Array, PyTree
 
 from .marks import marked
-from .possible import is_possible, NAME
+from .possible import is_possible, LARGEST_PROGRAM, NAME, num_equations
 from .rewriting import as_index, REWRITTEN, rewritten
 
 
@@ -40,6 +40,10 @@ class _Program:
         # The program that is run, which is rewritten if need be (derivatives are taken of
         # `jaxpr`), the constants that it takes first, and the inputs that it does not take.
         self._executed, self._consts, self._fixed = None, [], [None] * len(known)
+        # Evaluations outside of other programs share one compilation.
+        self.compiled = jax.jit(lambda *numbers: self.run(numbers))
+        if num_equations(jaxpr) > LARGEST_PROGRAM:
+            return
         if is_possible(jaxpr):
             self._executed = jaxpr
         elif is_possible(jaxpr, assumed=REWRITTEN):
@@ -47,8 +51,6 @@ class _Program:
             if is_possible(rewritten_program.jaxpr):
                 self._executed = rewritten_program.jaxpr
                 self._consts, self._fixed = rewritten_program.consts, known
-        # Evaluations outside of other programs share one compilation.
-        self.compiled = jax.jit(lambda *numbers: self.run(numbers))
 
     @property
     def is_possible(self) -> bool:

@@ -67,6 +67,13 @@ class Band:
         block, row = np.divmod(np.flatnonzero(self.order == size), width)
         self.padding[block, row, width + row] = 1
 
+    def description(self, size: int) -> str:
+        by = "LAPACK" if self.width >= LAPACK_FROM else "plain operations"
+        return (
+            f"block tridiagonal, {self.num_blocks} blocks of {self.width}, "
+            f"{self.num_colours} columns evaluated together, elimination by {by}"
+        )
+
     def is_cheaper_than_dense(self) -> bool:
         """Whether the block elimination needs less work than that of the dense matrix."""
         cost = 40 if self.width < LAPACK_FROM else 8

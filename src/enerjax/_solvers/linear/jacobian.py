@@ -44,6 +44,13 @@ class Dense:
         self._colours = column_colours(pattern, np.arange(shape_of(pattern)[1]))
         self._nonzero = pattern.toarray()
 
+    def description(self, size: int) -> str:
+        if self.solver is not None:
+            return f"dense, {type(self.solver).__name__} of lineax"
+        if size > SMALL:
+            return "dense, LU factors by LAPACK"
+        return "dense, an approximate inverse in plain operations"
+
     def evaluate(self, fn: Callable[[Array], Array], x: Float[Array, " n"]) -> Array:
         if self._colours is None:
             return (

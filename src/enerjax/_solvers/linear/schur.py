@@ -74,6 +74,14 @@ class SchurTables(Indices):
         self._find_entries(rows, columns, size)
         self._cut(incidence)
 
+    @property
+    def description(self) -> str:
+        stored = self.num_blocks * self.width**2 + (self.num_blocks - 1) * self.width**2
+        return (
+            f"{self.num_rows} rows, block tridiagonal, {self.num_blocks} blocks of "
+            f"{self.width}, {stored / self.num_rows**2:.0%} of a full matrix"
+        )
+
     def _find_entries(self, rows: np.ndarray, columns: np.ndarray, size: int) -> None:
         num_colours = int(self.colours.max(initial=0)) + 1
         row = np.arange(self.num_rows)[:, None, None]

@@ -143,6 +143,10 @@ class Sparse:
         products = coloured_products(fn, x, self._colours)
         return products[self.pattern.rows, self._colours[self.pattern.columns]]
 
+    def description(self, size: int) -> str:
+        entries = self.pattern.rows.size
+        return f"{entries} structural entries, {type(self.solver).__name__}"
+
     def empty(self, size: int, dtype: Any) -> "SparseFactors":
         """Placeholder factors, of the shapes that `renewed` returns."""
         del size

@@ -1,0 +1,182 @@
+"""What a step of a system computes, in words: to find out why it is slow."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from .._operators import AbstractModel, Increment, SeparableModel
+from .._programs import num_operations, why_not_one_function
+from .._run.inputs import prepare
+from .._run.stage import free_flight, step_problem
+from .._run.step import advance, first_warm, model_for
+from .._solvers import flattened, linearisable, Newton, RootFinder
+from .._system import AbstractSystem, RigidKinematics, State
+from .._types import Args, Scalar
+from ..schemes import AbstractScheme
+
+
+@dataclasses.dataclass(frozen=True)
+class Explanation:
+    """What a step computes; `print` shows it.
+
+    - `coordinates`: how the coordinates move.
+    - `solves`: the number of solves in a step.
+    - `unknowns`: the number of unknowns of a solve, by what they are.
+    - `method`: how they are searched for.
+    - `chord`: how the matrix `B M^-1 B^T` of the constraints is eliminated; `None` where
+      the chord method is not used.
+    - `jacobian`: how the exact Jacobian is stored and eliminated.
+    - `obstacles`: the operations that keep a step from being one function of machine code,
+      with the places where they are called; empty if it is one function.
+    - `operations`: the number of scalar operations of an evaluation of the step equations,
+      of which a correction needs one.
+    """
+
+    coordinates: str
+    solves: int
+    unknowns: dict[str, int]
+    method: str
+    chord: str | None
+    jacobian: str
+    obstacles: tuple[str, ...]
+    operations: int
+
+    def __str__(self) -> str:
+        parts = ", ".join(f"{count} {name}" for name, count in self.unknowns.items())
+        solves = "one solve" if self.solves == 1 else f"{self.solves} solves"
+        lines = [
+            f"coordinates: {self.coordinates}",
+            f"a step: {solves}, each of {sum(self.unknowns.values())} unknowns ({parts})",
+            f"method: {self.method}",
+            *([] if self.chord is None else [f"matrix of the constraints: {self.chord}"]),
+            f"exact Jacobian: {self.jacobian}",
+            f"step equations: about {self.operations} scalar operations",
+        ]
+        if not self.obstacles:
+            lines.append("one function of machine code: yes")
+        else:
+            lines.append("one function of machine code: no, because of")
+            lines += [f"    {obstacle}" for obstacle in self.obstacles]
+        return "\n".join(lines)
+
+
+def explain(
+    system: AbstractSystem,
+    scheme: AbstractScheme,
+    start: State,
+    args: Args = None,
+    *,
+    root_finder: RootFinder = Newton(),
+) -> Explanation:
+    """What a step of a system by a scheme computes, without computing it.
+
+    It tells which method finds the unknowns, how its matrices are eliminated, and whether
+    the step is one function of machine code, or because of which operations it is not. A
+    step that is none is several times slower if the system is small.
+
+    **Arguments:** as for `simulate`.
+
+    **Returns:** an `Explanation`; `print` it.
+
+    **Raises:** `ValueError` or `TypeError` for bad input, as `simulate` does.
+    """
+    start, args, h, _ = prepare(system, scheme, start, args, 1.0, 0.0, root_finder)
+    found: list[Explanation] = []
+
+    # Everything is found while this function is traced.
+    def traced(start: State, args: Args, h: Scalar) -> Scalar:
+        model = model_for(scheme, system, start, args)
+        found.append(_explained(scheme, model, model.to_internal(start), h, root_finder))
+        return h
+
+    jax.eval_shape(traced, start, args, h)
+    return found[0]
+
+
+def _explained(
+    scheme: AbstractScheme,
+    model: AbstractModel,
+    start: State,
+    h: Scalar,
+    root_finder: RootFinder,
+) -> Explanation:
+    warm = first_warm(scheme, model, start, h, *model.accelerations(start))
+    memory = jax.tree.map(lambda x: x[0], warm.stages)
+    by_chord = memory.chord_wait is not None and _chooses_itself(root_finder)
+    no = jnp.array(False)
+    step = lambda start, warm: advance(scheme, model, start, h, warm, root_finder, no)
+    problem = step_problem(scheme.stage, model, start, h, memory.carried)
+    z = free_flight(scheme.stage, problem, model, start)
+    flat, _, equations = flattened(_equations, z)
+    jacobian = f"as {type(root_finder).__name__} chooses"
+    if isinstance(root_finder, Newton):
+        redundant = jnp.ones_like(flat) if model.system.redundant else None
+        form = linearisable(
+            equations, flat, (scheme.stage, problem), root_finder.linear_solver, redundant
+        ).form
+        jacobian = form.description(flat.size)
+    newton = "Newton's method" if isinstance(root_finder, Newton) else jacobian
+    return Explanation(
+        coordinates=_coordinates(model, start),
+        solves=len(scheme.stages),
+        unknowns=_unknowns(z),
+        method=f"chord method; where that fails, {newton}" if by_chord else newton,
+        chord=_chord(model) if by_chord else None,
+        jacobian=jacobian,
+        obstacles=why_not_one_function(step, start, warm),
+        operations=num_operations(lambda x: equations(x, (scheme.stage, problem)), flat),
+    )
+
+
+def _equations(z: Any, args: Any) -> Any:
+    stage, problem = args
+    return stage.residual(z, problem)
+
+
+def _chooses_itself(root_finder: RootFinder) -> bool:
+    """Whether the linear algebra is that of this library."""
+    return isinstance(root_finder, Newton) and root_finder.linear_solver is None
+
+
+def _coordinates(model: AbstractModel, start: State) -> str:
+    count = start.q.size
+    if not isinstance(model, SeparableModel):
+        return f"{count} coordinates with {count} momenta"
+    if isinstance(model.kinematics, RigidKinematics):
+        bodies = model.kinematics.bodies
+        others = f", and {bodies.other_q.size} others" if bodies.other_q.size > 0 else ""
+        number = len(bodies.q)
+        return f"{number} rigid bodies, each moved by a translation and a rotation{others}"
+    if model.has_canonical_rates:
+        return f"{count} coordinates, whose rates are the velocities"
+    return f"{count} coordinates with {start.v.size} velocities v = L(q) qdot"
+
+
+def _chord(model: AbstractModel) -> str:
+    assert isinstance(model, SeparableModel)
+    assert model.constraint_tables is not None
+    return model.constraint_tables.description
+
+
+_NAMES = {
+    "rate": "increments",
+    "momentum": "momenta",
+    "impulse": "multipliers",
+    "velocity_impulse": "multipliers of velocity constraints",
+}
+
+
+def _unknowns(z: Any) -> dict[str, int]:
+    parts = jax.tree.leaves(z, is_leaf=lambda x: isinstance(x, Increment))
+    counts: dict[str, int] = {}
+    for part in parts:
+        named = (
+            {_NAMES[name]: getattr(part, name).size for name in _NAMES}
+            if isinstance(part, Increment)
+            else {"others": part.size}
+        )
+        for name, size in named.items():
+            counts[name] = counts.get(name, 0) + size
+    return {name: size for name, size in counts.items() if size > 0}

@@ -1,0 +1,85 @@
+"""`explain` tells which way a step goes, before it is compiled."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import pytest
+
+import enerjax as ej
+
+from .helpers import problem
+from .test_one_function import pytestmark  # noqa: F401
+
+
+def explained(name, scheme: Any = ej.EnergyPreserving()):
+    system, start, args = problem(name)
+    return ej.explain(system, scheme, start, args)
+
+
+def test_a_small_system_is_one_function():
+    found = explained("double")
+    assert found.solves == 1
+    assert found.unknowns == {
+        "increments": 4,
+        "multipliers": 2,
+        "multipliers of velocity constraints": 2,
+    }
+    assert found.obstacles == ()
+    assert found.chord is None
+    text = str(found)
+    assert "each of 8 unknowns" in text
+    assert "one function of machine code: yes" in text
+
+
+def test_a_composition_has_several_solves():
+    scheme = ej.Composed(ej.EnergyPreserving(), 4)
+    assert explained("double", scheme).solves == len(scheme.stages) > 1
+
+
+def test_lagrangians_are_one_function_too():
+    system, start, args = ej.problems.double_pendulum_angles()
+    found = ej.explain(system, ej.EnergyPreserving(), start, args)
+    assert found.coordinates == "2 coordinates with 2 momenta"
+    assert found.obstacles == ()
+
+
+def test_operations_of_the_user_are_named():
+    def force(q, v, t, args):
+        return -jnp.linalg.cholesky(jnp.eye(2) + jnp.outer(q, q)) @ v
+
+    system = ej.System(jnp.eye(2), lambda q, args: 0.5 * q @ q, force=force)
+    start = ej.State([1.0, 0.5], [0.0, 0.0])
+    found = ej.explain(system, ej.EnergyPreserving(), start)
+    assert any(x.startswith("`cholesky`") for x in found.obstacles)
+    assert "because of\n" in str(found)
+
+
+def test_a_step_of_too_many_operations_is_no_single_function():
+    long_sum = lambda q, args: sum(jnp.sin(k * q[0]) for k in range(1, 900)) + q @ q
+    start = ej.State([1.0, 0.5], [0.0, 0.0])
+    system = ej.System(jnp.eye(2), long_sum)
+    (obstacle,) = ej.explain(system, ej.EnergyPreserving(), start).obstacles
+    assert obstacle.startswith("its length")
+
+
+def test_a_chain_is_eliminated_block_by_block():
+    system, start, args = ej.problems.chain(24)
+    found = ej.explain(system, ej.EnergyPreserving(), start, args)
+    assert found.method.startswith("chord method")
+    assert found.chord is not None
+    assert found.chord.startswith("24 rows, block tridiagonal, 24 blocks of 1")
+    assert found.jacobian.startswith("block tridiagonal")
+    by_klu = ej.explain(
+        system,
+        ej.EnergyPreserving(),
+        start,
+        args,
+        root_finder=ej.Newton(linear_solver=ej.KLU()),
+    )
+    assert by_klu.chord is None
+    assert by_klu.jacobian.endswith("entries, KLU")
+
+
+def test_bad_input_is_refused_as_in_a_run():
+    with pytest.raises(TypeError, match="scheme"):
+        explained("double", ej.EnergyPreserving)
