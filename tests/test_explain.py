@@ -69,6 +69,11 @@ def test_a_chain_is_eliminated_block_by_block():
     assert found.chord is not None
     assert found.chord.startswith("24 rows, block tridiagonal, 24 blocks of 1")
     assert found.jacobian.startswith("block tridiagonal")
+
+
+def test_a_sparse_solver_replaces_the_chord_method():
+    pytest.importorskip("klujax")
+    system, start, args = ej.problems.chain(24)
     by_klu = ej.explain(
         system,
         ej.EnergyPreserving(),
