@@ -43,14 +43,16 @@ def test_lagrangians_are_one_function_too():
     assert found.obstacles == ()
 
 
-def test_operations_of_the_user_are_named():
+def test_operations_of_the_user_are_named_with_their_lines():
     def force(q, v, t, args):
         return -jnp.linalg.cholesky(jnp.eye(2) + jnp.outer(q, q)) @ v
 
     system = ej.System(jnp.eye(2), lambda q, args: 0.5 * q @ q, force=force)
     start = ej.State([1.0, 0.5], [0.0, 0.0])
     found = ej.explain(system, ej.EnergyPreserving(), start)
-    assert any(x.startswith("`cholesky`") for x in found.obstacles)
+    (of_cholesky,) = [x for x in found.obstacles if x.startswith("`cholesky`")]
+    assert "test_explain.py" in of_cholesky
+    assert "force" in of_cholesky
     assert "because of\n" in str(found)
 
 

@@ -96,6 +96,15 @@ def test_jit_around_a_run_changes_nothing():
     np.testing.assert_allclose(eqx.filter_jit(run)(numbers).ys.q, run(numbers).ys.q, **SAME)
 
 
+def compiled_by(run, caplog):
+    """The messages about the programs that a call compiles."""
+    caplog.clear()
+    with jax.log_compiles():
+        run()
+    messages = [record.getMessage() for record in caplog.records]
+    return [message for message in messages if "Compiling" in message]
+
+
 @pytest.mark.parametrize("scheme", long(["preserving", "decaying"], "preserving"))
 def test_new_numbers_compile_nothing(scheme, caplog):
     system, start, args = problem("pendulum")
@@ -111,19 +120,9 @@ def test_new_numbers_compile_nothing(scheme, caplog):
     simulate(**first)
     changes = dict(alpha=0.2, h=0.02, g=1.6, x=0.6, v=0.5)
     for name, value in changes.items():
-        with jax.log_compiles():
-            simulate(**first | {name: value})
-        compiled = [r.getMessage() for r in caplog.records if "Compiling" in r.getMessage()]
+        changed = first | {name: value}
+        compiled = compiled_by(lambda changed=changed: simulate(**changed), caplog)
         assert not compiled, f"a new {name} compiled {compiled}"
-
-
-def compiled_by(run, caplog):
-    """The messages about the programs that a call compiles."""
-    caplog.clear()
-    with jax.log_compiles():
-        run()
-    messages = [record.getMessage() for record in caplog.records]
-    return [message for message in messages if "Compiling" in message]
 
 
 def simulate_pendulum(num_steps, g=9.81, **options):

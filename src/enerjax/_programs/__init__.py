@@ -2,13 +2,11 @@
 
 from . import primitives as primitives
 from .compiled import at_top_level as at_top_level, compiled as compiled
+from .counting import num_operations as num_operations
 from .fast_loops import enable_fast_loops as enable_fast_loops
 from .lanes import in_any_lane as in_any_lane
 from .one_function.calls import in_one_function as in_one_function, unmerged as unmerged
-from .one_function.obstacles import (
-    num_operations as num_operations,
-    why_not_one_function as why_not_one_function,
-)
+from .one_function.obstacles import why_not_one_function as why_not_one_function
 from .one_function.possible import LARGEST_SUM as LARGEST_SUM
 from .one_function.products import plain_products as plain_products, summed as summed
 from .sparsity.jacobian_columns import (

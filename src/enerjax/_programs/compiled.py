@@ -49,8 +49,10 @@ _zero = jax.jit(lambda: 0.0)
 
 
 def at_top_level(arguments: PyTree[Any]) -> bool:
-    """Whether a call with these arguments is part of no transformation, as far as can be
-    seen: a function among them may have a traced closure."""
+    """Whether a call with these arguments is outside of all transformations.
+
+    A traced value in the closure of a function among them is not noticed.
+    """
     return is_known(arguments) and not isinstance(_zero(), Tracer)
 
 

@@ -11,7 +11,7 @@ import jaxlib
 # library inside (1024 by default).
 _FLAGS = ["--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=10000000"]
 if jaxlib.version.__version_info__ >= (0, 10, 2):
-    # Without this small reductions and products would call a library. XLA ends the
+    # Without this flag small reductions and products would call a library. XLA ends the
     # process at a flag that it does not know, as in older versions.
     _FLAGS.append("--xla_cpu_experimental_ynn_fusion_type=-dot,-reduce,-eltwise")
     # For the time of compilation; see `compiled`.

@@ -213,6 +213,10 @@ class _ControlledPlan(AbstractPlan):
     def num_rejected(self, memory: _Memory) -> Count:
         return memory.num_rejected
 
+    def rounded_up(self) -> "_ControlledPlan":
+        # Its bound on the attempts does not depend on the length of the run.
+        return self
+
     def _error(
         self, model: AbstractModel, a: State, b: State, h: Scalar, at_start: Pair
     ) -> tuple[Scalar, Pair]:

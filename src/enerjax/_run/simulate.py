@@ -20,7 +20,7 @@ from .loop import run_loop, Stepper
 from .saving import AbstractSaving, RecordedRun, SaveAt, SaveFunction, saving_of
 from .solution import first_rows, Solution, Statistics
 from .step import model_for
-from .step_sizes import AbstractController, AbstractPlan, EqualSteps, find_end, rounded_up
+from .step_sizes import AbstractController, AbstractPlan, EqualSteps, find_end
 
 
 def simulate(
@@ -105,7 +105,7 @@ def simulate(
         max_halvings=max_halvings,
     )
     if at_top_level(task):
-        task = dataclasses.replace(task, plan=rounded_up(plan))
+        task = dataclasses.replace(task, plan=plan.rounded_up())
     with explained_memory_error(plan.max_attempts):
         solution, reached = _run(task)
     if solution.ts.size > saving.num_rows(plan):

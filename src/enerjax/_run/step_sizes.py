@@ -89,6 +89,14 @@ class AbstractPlan(eqx.Module):
         """The number of steps that were repeated with another length; `None` if a plan
         never does that."""
 
+    @abc.abstractmethod
+    def rounded_up(self) -> "AbstractPlan":
+        """The same steps, in a program that runs of other lengths can share.
+
+        `max_attempts` is rounded up to a power of two. Attempts that are not needed cost
+        next to nothing.
+        """
+
 
 class AbstractController(eqx.Module):
     """Chooses the steps of a run: `EqualSteps` or a `StepController`."""
@@ -185,17 +193,9 @@ class _EqualPlan(AbstractPlan):
     def num_rejected(self, memory: None) -> None:
         return None
 
-
-def rounded_up(plan: AbstractPlan) -> AbstractPlan:
-    """The plan with room for the next power of two of equal steps.
-
-    Runs of similar lengths then share one program. Steps that are not needed cost next to
-    nothing.
-    """
-    if not isinstance(plan, _EqualPlan):
-        return plan
-    room = 1 << (plan.max_attempts - 1).bit_length()
-    return dataclasses.replace(plan, max_attempts=room, is_counted=False)
+    def rounded_up(self) -> "_EqualPlan":
+        room = 1 << (self.max_attempts - 1).bit_length()
+        return dataclasses.replace(self, max_attempts=room, is_counted=False)
 
 
 def find_end(

@@ -9,8 +9,10 @@ import jax.numpy as jnp
 from .._operators import AbstractModel, Increment, SeparableModel
 from .._programs import num_operations, why_not_one_function
 from .._run.inputs import prepare
+from .._run.loop import Stepper
 from .._run.stage import free_flight, step_problem
-from .._run.step import advance, first_warm, model_for
+from .._run.step import model_for
+from .._run.step_sizes import End, EqualSteps
 from .._solvers import flattened, linearisable, Newton, RootFinder
 from .._system import AbstractSystem, RigidKinematics, State
 from .._types import Args, Scalar
@@ -74,7 +76,7 @@ def explain(
 
     It tells which method finds the unknowns, how its matrices are eliminated, and whether
     the step is one function of machine code, or because of which operations it is not. A
-    step that is none is several times slower if the system is small.
+    step that is not one function takes several times as long if the system is small.
 
     **Arguments:** as for `simulate`.
 
@@ -102,11 +104,12 @@ def _explained(
     h: Scalar,
     root_finder: RootFinder,
 ) -> Explanation:
-    warm = first_warm(scheme, model, start, h, *model.accelerations(start))
-    memory = jax.tree.map(lambda x: x[0], warm.stages)
+    plan = EqualSteps().plan(scheme, h, jnp.zeros_like(h), End(num_steps=1))
+    stepper = Stepper(scheme, model, plan, root_finder, None)
+    begin = stepper.begin(start)
+    memory = jax.tree.map(lambda x: x[0], begin.warm.stages)
     by_chord = memory.chord_wait is not None and _chooses_itself(root_finder)
-    no = jnp.array(False)
-    step = lambda start, warm: advance(scheme, model, start, h, warm, root_finder, no)
+    step = lambda progress: stepper.attempt(progress, jnp.array(True))
     problem = step_problem(scheme.stage, model, start, h, memory.carried)
     z = free_flight(scheme.stage, problem, model, start)
     flat, _, equations = flattened(_equations, z)
@@ -125,7 +128,7 @@ def _explained(
         method=f"chord method; where that fails, {newton}" if by_chord else newton,
         chord=_chord(model) if by_chord else None,
         jacobian=jacobian,
-        obstacles=why_not_one_function(step, start, warm),
+        obstacles=why_not_one_function(step, begin),
         operations=num_operations(lambda x: equations(x, (scheme.stage, problem)), flat),
     )
 

@@ -57,16 +57,13 @@ def is_possible(jaxpr: Jaxpr, assumed: Collection[str] = ()) -> bool:
     return next(obstacles(jaxpr, assumed), None) is None
 
 
-def num_equations(jaxpr: Any) -> int:
-    """The number of array operations of a program, including those of all branches."""
-    inner = lambda eqn: [num_equations(program) for program in programs_within(eqn)]
-    return sum(sum(inner(eqn)) or 1 for eqn in jaxpr.eqns)
+def obstacles(jaxpr: Any, assumed: Collection[str] = ()) -> Iterator[list[Any]]:
+    """What keeps a program from being one function, if all primitives in `assumed` can be.
 
-
-def obstacles(jaxpr: Any, assumed: Collection[str] = ()) -> Iterator[Any]:
-    """What keeps a program from being one function, if all primitives in `assumed` can be
-    in one: equations, and variables that hold no plain numbers."""
-    yield from (x for x in (*jaxpr.constvars, *jaxpr.invars) if not _is_plain(x))
+    Each obstacle is a list. Its last entry is an equation, or a variable that holds no
+    plain numbers; the others are the equations whose programs it is in, outermost first.
+    """
+    yield from ([x] for x in (*jaxpr.constvars, *jaxpr.invars) if not _is_plain(x))
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
         if name in assumed or name == NAME:
@@ -78,9 +75,9 @@ def obstacles(jaxpr: Any, assumed: Collection[str] = ()) -> Iterator[Any]:
         else:
             possible = name in POSSIBLE
         if not possible:
-            yield eqn
+            yield [eqn]
         for inner in programs_within(eqn):
-            yield from obstacles(inner, assumed)
+            yield from ([eqn, *within] for within in obstacles(inner, assumed))
 
 
 def _is_plain(variable: Any) -> bool:

@@ -12,8 +12,9 @@ from jax.interpreters import ad, batching, mlir
 from jax.interpreters.partial_eval import dce_jaxpr_consts
 from jaxtyping import Array, PyTree
 
+from ..counting import num_equations
 from .marks import marked
-from .possible import is_possible, LARGEST_PROGRAM, NAME, num_equations
+from .possible import is_possible, LARGEST_PROGRAM, NAME
 from .rewriting import as_index, REWRITTEN, rewritten
 
 
@@ -24,7 +25,7 @@ def call(fn: Callable[..., PyTree[Array]], *args: PyTree[Array]) -> PyTree[Array
     return jax.tree.unflatten(jax.tree.structure(like), map(jnp.asarray, out))
 
 
-class _Program:
+class Program:
     """A program as the parameter of a primitive.
 
     - `jaxpr`: its constants are passed as the first inputs. They can be traced, and a
@@ -90,7 +91,7 @@ def _run(
     jaxpr, of_consts, of_inputs = dce_jaxpr_consts(closed.jaxpr, computed)
     needed, _ = _split([*of_consts, *of_inputs], numbers)
     linear = sum(of_inputs[len(of_inputs) - linear :])
-    program = _Program(jaxpr, list(map(as_index, needed)), linear)
+    program = Program(jaxpr, list(map(as_index, needed)), linear)
     needed = list(map(jnp.asarray, needed))
     if any(computed) and program.is_possible:
         out = ONE_FUNCTION.bind(*needed, program=program)
@@ -107,18 +108,18 @@ ONE_FUNCTION.multiple_results = True
 
 
 @ONE_FUNCTION.def_impl
-def _evaluated(*numbers: Array, program: _Program) -> list[Array]:
+def _evaluated(*numbers: Array, program: Program) -> list[Array]:
     # With `jax_disable_jit`, as in the search for NaNs, another `jit` would come back here.
     is_apart = jax.config.jax_disable_jit  # pyright: ignore[reportAttributeAccessIssue]
     return program(numbers) if is_apart else program.compiled(*numbers)
 
 
 @ONE_FUNCTION.def_abstract_eval
-def _shapes(*_: Any, program: _Program) -> list[Any]:
+def _shapes(*_: Any, program: Program) -> list[Any]:
     return [x.aval for x in program.jaxpr.outvars]
 
 
-def _jvp(primals: Any, tangents: Any, *, program: _Program) -> tuple[list, list]:
+def _jvp(primals: Any, tangents: Any, *, program: Program) -> tuple[list, list]:
     """Values in one function, with the residuals of the linearisation; rates in another."""
     has_tangent = [not isinstance(t, ad.Zero) for t in tangents]
     moved, _ = _split(has_tangent, tangents)
@@ -156,7 +157,7 @@ def _depends(closed: ClosedJaxpr, linear: int) -> list[bool]:
     return [id(x) in on for x in jaxpr.outvars]
 
 
-def _transpose(cotangents: Any, *numbers: Any, program: _Program) -> list:
+def _transpose(cotangents: Any, *numbers: Any, program: Program) -> list:
     wanted = [ad.is_undefined_primal(x) for x in numbers]
     unknown, known = _split(wanted, numbers)
     has_cotangent = [not isinstance(ct, ad.Zero) for ct in cotangents]
@@ -174,7 +175,7 @@ def _transpose(cotangents: Any, *numbers: Any, program: _Program) -> list:
     return _merged(wanted, out, [None] * len(known))
 
 
-def _lanes(numbers: Any, axes: Any, *, program: _Program) -> tuple[list, list[int]]:
+def _lanes(numbers: Any, axes: Any, *, program: Program) -> tuple[list, list[int]]:
     batched = [axis is not None for axis in axes]
     own, shared = _split(batched, numbers)
     axes, _ = _split(batched, axes)
@@ -202,7 +203,7 @@ def _is_sharded(x: Array) -> bool:
     return any(axis is not None for axis in jax.typeof(x).sharding.spec)
 
 
-def _lowered(*numbers: Array, program: _Program) -> list[Array]:
+def _lowered(*numbers: Array, program: Program) -> list[Array]:
     return program.run(numbers)
 
 

@@ -62,7 +62,7 @@ def _equation(eqn: Any, values: list[Any]) -> list[Any]:
         if name in SCATTERS and isinstance(values[1], np.ndarray):
             return [_scattered(name, values, params)]
         if name in _OF_PAIRS:
-            return [_reduced(name, jnp.asarray(values[0]), params["axes"])]
+            return [_reduced(eqn.primitive, jnp.asarray(values[0]), params)]
     elif any(map(_needs_rewriting, programs_within(eqn))):
         if name in _LOOPS:
             return _LOOPS[name](values, params)
@@ -183,9 +183,10 @@ _OF_PAIRS: dict[str, Callable[[Any, Any], Any]] = {
 _SIDE_BY_SIDE = 64
 
 
-def _reduced(name: str, x: Array, axes: Sequence[int]) -> Array:
+def _reduced(primitive: Any, x: Array, params: dict[str, Any]) -> Array:
     """A reduction over axes: a loop over rows of terms, then a small one over the rest."""
-    op, kept = _OF_PAIRS[name], [k for k in range(x.ndim) if k not in axes]
+    op, axes = _OF_PAIRS[primitive.name], params["axes"]
+    kept = [k for k in range(x.ndim) if k not in axes]
     shape = tuple(x.shape[k] for k in kept)
     size = math.prod(shape)
     terms = jnp.transpose(x, (*axes, *kept)).reshape(-1, size)
@@ -199,17 +200,9 @@ def _reduced(name: str, x: Array, axes: Sequence[int]) -> Array:
     rest = [*total.reshape(width, size), *terms[whole:]]
     if len(rest) <= _UNROLLED:
         return functools.reduce(op, rest).reshape(shape)
-    return _REDUCTIONS[name](jnp.stack(rest), axis=0).reshape(shape)
+    (out,) = evaluate(primitive, [jnp.stack(rest)], params | dict(axes=(0,)))
+    return out.reshape(shape)
 
-
-_REDUCTIONS = {
-    "reduce_sum": jnp.sum,
-    "reduce_prod": jnp.prod,
-    "reduce_max": jnp.max,
-    "reduce_min": jnp.min,
-    "reduce_and": jnp.all,
-    "reduce_or": jnp.any,
-}
 
 # Primitives that this module replaces, where their indices are known and sizes allow it.
 REWRITTEN = SCATTERS | _OF_PAIRS.keys() | {CONTRACTION}
