@@ -72,7 +72,7 @@ def test_a_joint_leaves_its_degrees_of_freedom_and_carries_all_other_loads(name)
     system, q, args = scene.system, scene.q, scene.args
     assert system.constraint is not None
     of_joint = jax.jacfwd(system.constraint)(q, args)
-    jacobian = np.concatenate([of_joint, jax.jacfwd(system.internal)(q)])
+    jacobian = np.concatenate([of_joint, jax.jacfwd(system.kinematics.constraint)(q)])
     # Those of the joint, and six constraints of the directors.
     assert np.linalg.matrix_rank(jacobian) == len(jacobian) == 6 - len(motions) + 6
     for velocity, spin in motions:

@@ -50,7 +50,7 @@ class Step:
         return self.rng.normal(size=self.bodies.num_velocities if size is None else size)
 
     def rates(self, q, v):
-        return np.asarray(self.kinematics.lift(q, v, lambda q: q[None, :0], None))
+        return np.asarray(self.kinematics.user_velocity(q, v))
 
     def axes(self, q):
         """The directors of the bodies as rows, shape `(bodies, 3, 3)`."""
@@ -91,7 +91,7 @@ def test_a_step_of_any_length_leaves_directors_orthonormal(table, size):
     axes = step.axes(step.qb)
     near(axes @ axes.transpose(0, 2, 1), np.broadcast_to(np.eye(3), axes.shape), 0.1)
     near(np.linalg.det(axes), np.ones(len(axes)), 0.1)
-    near(step.bodies.internal(step.qb), np.zeros(6 * len(axes)), 0.1)
+    near(step.bodies.constraint(step.qb), np.zeros(6 * len(axes)), 0.1)
 
 
 @each_table
@@ -157,12 +157,15 @@ def test_functions_of_inner_products_exert_no_torque_in_space(table):
 def test_the_change_of_rates_is_that_of_a_rotation_and_of_the_velocities(table):
     """`Y_b - Y_a = theta x Ym + Rm^-T ((W_b - W_a) x e_i)`, in products with any `S`."""
     step = Step(table)
-    rates = [step.rates(q, v) for q, v in [(step.qa, step.va), (step.qb, step.vb)]]
+    ends = [ej.State(step.qa, step.va), ej.State(step.qb, step.vb)]
+    rates = [step.rates(np.asarray(end.q), np.asarray(end.v)) for end in ends]
     mean = (rates[0] + rates[1]) / 2
     for _ in range(5):
         s = step.random(step.qa.size)
-        rows = step.kinematics.spin_rows(step.qa, mean, s)
-        momentum = step.kinematics.momentum_of_rates(step.qa, step.step, s)
+        by_rates = [(end.q, part * s) for end, part in zip(ends, (1.5, 0.5), strict=True)]
+        at, rows = step.kinematics.mean_rates(*ends, step.rates, lambda x=by_rates: x)
+        near(at(step.random(step.qa.size)), mean)
+        momentum = step.kinematics.momentum_of_rates(*by_rates, step.step, None)
         found = rows @ step.step + momentum @ (step.vb - step.va)
         near(found, s @ (rates[1] - rates[0]), 10)
 

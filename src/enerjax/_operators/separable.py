@@ -36,9 +36,10 @@ from .._solvers import (
 )
 from .._system import (
     AbstractKinematics,
+    ByRates,
     Frames,
-    IdentityKinematics,
-    RigidKinematics,
+    mean_momentum,
+    Rates,
     State,
     System,
 )
@@ -65,9 +66,8 @@ from .interval import Gradient, gradient_and_work, Increment, Scales, Time, time
 class SeparableModel(AbstractModel):
     """A `System` for fixed `args`; the `v` of its states are the velocities.
 
-    With `rotates`, its rigid bodies are moved by rotations: the velocities of a body are
-    `(xdot, W)`, and its directors need no constraints. Otherwise the velocities are those
-    of the user, and the constraints between the directors follow those of the user.
+    With `rotates`, its rigid bodies are moved by rotations, and velocities and constraints
+    are those of this kind of coordinates. Otherwise the velocities are those of the user.
     """
 
     system: System
@@ -80,7 +80,7 @@ class SeparableModel(AbstractModel):
     kinematics: AbstractKinematics
     # The index tables of `constraint_matrix`; `None` where there is none.
     constraint_tables: SchurTables | None = eqx.field(static=True)
-    # For bodies that are moved by rotations, the model with their directors as coordinates.
+    # The model without rotations, if this one has some.
     without_rotations: "SeparableModel | None"
 
     def __init__(
@@ -94,15 +94,15 @@ class SeparableModel(AbstractModel):
         self.system = system
         self.args = args
         self.has_linear_potential = has_linear_potential(system, state.q, args)
-        bodies = system.bodies(state.q) if rotates else None
-        if bodies is None:
-            self.kinematics = system.kinematics.with_blocks(state.q, self.coordinate, args)
-            self.inertia = system.inertia(state, args)
-        else:
-            self.kinematics = RigidKinematics(bodies)
-            self.inertia = system.inertia_of_rotations(bodies, args, state.q.dtype)
-        rotates = bodies is not None
+        kind = system.kinematics.with_rotations(state.q) if rotates else system.kinematics
+        rotates = kind is not system.kinematics
         self.without_rotations = SeparableModel(system, state, args) if rotates else None
+        self.kinematics = kind.with_blocks(state.q, self.coordinate, args)
+        self.inertia = kind.inertia(
+            lambda: system.inertia(state, args),
+            lambda v: system.kinetic_energy(State(state.q, v), args),
+            state.q.dtype,
+        )
         self.inverse_inertia = inverse_of(self.inertia)
         self.scales = self._scales(state)
         self.constraint_tables = self._constraint_tables(state)
@@ -113,34 +113,32 @@ class SeparableModel(AbstractModel):
 
     @property
     def has_canonical_rates(self) -> bool:
-        return isinstance(self.kinematics, IdentityKinematics)
+        return self.kinematics.has_canonical_rates
 
     def to_internal(self, state: State) -> State:
-        if isinstance(self.kinematics, RigidKinematics):
-            return State(state.q, self.kinematics.velocity(state.q, state.v), state.t)
-        return state
+        return State(state.q, self.kinematics.velocity(state.q, state.v), state.t)
 
     def to_user(self, state: State) -> State:
-        return State(state.q, self._user_velocity(state.q, state.v))
+        return State(state.q, self.kinematics.user_velocity(state.q, state.v))
 
     @property
     def in_rates(self) -> "SeparableModel":
         return self if self.without_rotations is None else self.without_rotations
 
     def to_rates(self, state: State) -> State:
-        return State(state.q, self._user_velocity(state.q, state.v), state.t)
+        velocity = self.kinematics.user_velocity(state.q, state.v)
+        return State(state.q, velocity, state.t)
 
     def user_multipliers(self, multipliers: Multipliers) -> Multipliers:
-        """With zeros for the constraints between directors, which rotations satisfy."""
-        if not isinstance(self.kinematics, RigidKinematics):
+        """With zeros for the constraints that rotations satisfy by themselves."""
+        if self.without_rotations is None:
             return multipliers
-        q = self.kinematics.bodies.at_rest(multipliers.dtype)
-        count = jax.eval_shape(self.fixed, q).size
-        none = jnp.zeros((self.system.internal(q).size,), multipliers.dtype)
-        return jnp.concatenate([multipliers[:count], none, multipliers[count:]])
-
-    def _user_velocity(self, q: Coordinates, v: Velocities) -> Velocities:
-        return self.lift(q, v) if isinstance(self.kinematics, RigidKinematics) else v
+        q = self.scales.coordinate
+        own, all_rows = (
+            jax.eval_shape(model.fixed, q).size for model in (self, self.in_rates)
+        )
+        none = jnp.zeros((all_rows - own,), multipliers.dtype)
+        return jnp.concatenate([multipliers[:own], none, multipliers[own:]])
 
     def kinetic(self, state: State) -> Scalar:
         return 0.5 * state.v @ self.inertia @ state.v
@@ -171,16 +169,14 @@ class SeparableModel(AbstractModel):
         return self.system.coordinate_constraint(q, self.args)
 
     def fixed(self, q: Coordinates) -> Float[Array, " nf"]:
-        joints = self.user_constraint(q)
-        if self.system.rigid_bodies is None or isinstance(self.kinematics, RigidKinematics):
-            return joints
-        return jnp.concatenate([joints, self.system.internal(q)])
+        joints, own = self.user_constraint(q), self.kinematics.constraint(q)
+        return jnp.concatenate([joints, own]) if own.size > 0 else joints
 
     def constraint(self, q: Coordinates, t: Time) -> Multipliers:
         return jnp.concatenate([self.joint(q, t), self.coordinate(q)])
 
     def force(self, q: Coordinates, v: Velocities, t: Time) -> Velocities:
-        return self.user_force(q, self._user_velocity(q, v), t)
+        return self.user_force(q, self.kinematics.user_velocity(q, v), t)
 
     def slope(self, state: State) -> Increments:
         q = state.q
@@ -203,9 +199,7 @@ class SeparableModel(AbstractModel):
         velocities: Callable[[Reaction], tuple[Velocities, ...]],
         step: Increments | None,
     ) -> tuple[Velocities, ...]:
-        if step is None or not isinstance(self.kinematics, RigidKinematics):
-            return velocities(self._mean_reaction)
-        return velocities(functools.partial(self._reaction_of_step, step))
+        return velocities(functools.partial(self._reaction, step))
 
     def momentum_rows(self, rates: Velocities) -> Float[Array, " np"]:
         return rates[:0]
@@ -240,14 +234,7 @@ class SeparableModel(AbstractModel):
         is_step: bool,
     ) -> Gradient:
         fixed, driven = self.split(increment, a.q)
-        eta, torque = increment.velocity_impulse, None
-        mean_velocity = 0.5 * (a.v + b.v)
-        mean_rate = lambda q: self.lift(q, mean_velocity)
-        if is_step and isinstance(self.kinematics, RigidKinematics) and eta.size > 0:
-            constant = 0.5 * (self.lift(a.q, a.v) + self.lift(b.q, b.v))
-            mean_rate = lambda q: constant
-            by_rate = self._mean_joint_force((a.q, a.t), (b.q, b.t), eta)
-            torque = h * self.kinematics.spin_rows(a.q, constant, by_rate)
+        mean_rate, torque = self._mean_rates(a, b, h, increment, is_step)
 
         constraint = lambda q: jnp.concatenate([self.fixed(q), self.coordinate(q)])
         rate = lambda q: jax.jvp(self.fixed, (q,), (mean_rate(q),))[1]
@@ -300,66 +287,62 @@ class SeparableModel(AbstractModel):
     def reaction_row(self, state: State, eta: JointMultipliers) -> Float[Array, " np"]:
         return jnp.zeros((0,), state.q.dtype)
 
-    def _mean_reaction(self, a: Position, b: Position, eta: JointMultipliers) -> Velocities:
-        return 0.5 * (self.reaction_at(*a, eta) + self.reaction_at(*b, eta))
+    def _mean_rates(
+        self, a: State, b: State, h: Scalar, increment: Increment, is_step: bool
+    ) -> tuple[Rates, Increments | None]:
+        """The rates in the gradient of `psi` with respect to `q`, and further rows."""
+        eta = increment.velocity_impulse
+        if not is_step or eta.size == 0:
+            mean = 0.5 * (a.v + b.v)
+            return lambda q: self.lift(q, mean), None
+        at = lambda state: self._by_rates((state.q, state.t), eta)
+        by_rates = lambda: (at(a), at(b))
+        rates, rows = self.kinematics.mean_rates(a, b, self.lift, by_rates)
+        return rates, None if rows is None else h * rows
 
-    def _reaction_of_step(
-        self, step: Increments, a: Position, b: Position, eta: JointMultipliers
+    def _reaction(
+        self, step: Increments | None, a: Position, b: Position, eta: JointMultipliers
     ) -> Velocities:
-        """The reaction over the interval of a step; see `RigidKinematics.spin_rows`."""
-        assert isinstance(self.kinematics, RigidKinematics)
+        """The reaction over an interval, which is that of `step` if this is not `None`."""
         if eta.size == 0:
-            return jnp.zeros_like(step)
-        by_rate = self._mean_joint_force(a, b, eta)
-        momentum = self.kinematics.momentum_of_rates(a[0], step, by_rate)
+            return jnp.zeros((self.inertia.shape[0],), eta.dtype)
+        ends = self._by_rates(a, eta), self._by_rates(b, eta)
+        if step is None:
+            momentum = mean_momentum(*ends, self._lowered)
+        else:
+            momentum = self.kinematics.momentum_of_rates(*ends, step, self._lowered)
         return self.inverse_inertia @ momentum
 
-    def _mean_joint_force(
-        self, a: Position, b: Position, eta: JointMultipliers
-    ) -> Coordinates:
-        """The mean of `B^T eta` of the joints at two positions, shape `(nq,)`."""
+    def _by_rates(self, position: Position, eta: JointMultipliers) -> ByRates:
+        """`B^T eta` of the joints: the gradient of `eta . psi` with respect to the rates
+        of the coordinates."""
+        q, t = position
+        _, transpose = jax.vjp(lambda q: self.joint(q, t), q)
+        return q, transpose(eta)[0]
 
-        def at(position: Position) -> Coordinates:
-            q, t = position
-            _, transpose = jax.vjp(lambda q: self.joint(q, t), q)
-            return transpose(eta)[0]
-
-        return 0.5 * (at(a) + at(b))
+    def _lowered(self, q: Coordinates, force: Coordinates) -> Velocities:
+        """`L^+(q)^T force`, the momentum of a gradient with respect to the rates."""
+        rest = jnp.zeros((self.inertia.shape[0],), q.dtype)
+        _, transpose = jax.vjp(lambda v: self.lift(q, v), rest)
+        return transpose(force)[0]
 
     def reaction_at(self, q: Coordinates, t: Time, eta: JointMultipliers) -> Velocities:
         """`M^-1 C(q, t)^T eta`; as `psi` is affine in `v`, the same for every `v`."""
-        rest = jnp.zeros((self.inertia.shape[0],), q.dtype)
         if eta.size == 0:
-            return rest
-        _, transpose = jax.vjp(lambda v: self.joint_change(q, v, t), rest)
-        return self.inverse_inertia @ transpose(eta)[0]
+            return jnp.zeros((self.inertia.shape[0],), q.dtype)
+        return self.inverse_inertia @ self._lowered(*self._by_rates((q, t), eta))
 
     def joint_change(self, q: Coordinates, v: Velocities, t: Time) -> JointMultipliers:
         """`C(q, t) v`, the part of `psi` that is linear in `v`."""
         return jax.jvp(lambda q: self.joint(q, t), (q,), (self.lift(q, v),))[1]
 
     def metric(self, state: State) -> Symmetric:
-        """The inertia matrix of the coordinates, regular also where they are redundant.
-
-        It is `L^T M L + m sum_i b_i b_i^T`, with the normalised gradients `b_i` of the
-        coordinate constraints. `m` is the mean inertia of a coordinate, so the result does
-        not depend on the units of the constraints.
-        """
-        if self.has_canonical_rates or isinstance(self.kinematics, RigidKinematics):
-            return self.inertia
-        q = state.q
-        pull = jax.vmap(self._momentum_rows, in_axes=(None, 0))
-        inertia = pull(q, pull(q, as_dense(self.inertia)).T)
-        rows = jax.jacfwd(self.coordinate)(q)
-        unit = rows / jnp.linalg.norm(rows, axis=1, keepdims=True)
-        return inertia + jnp.trace(inertia) / q.size * (unit.T @ unit)
+        return self.kinematics.metric(state.q, self.inertia, self.coordinate, self.args)
 
     def inverse_metric(self, state: State) -> Symmetric:
         return self.inverse_inertia
 
     def coordinate_scale(self, step: Increments) -> Coordinates:
-        if not isinstance(self.kinematics, RigidKinematics):
-            return step
         return self.kinematics.coordinate_scale(step)
 
     def stiffness(

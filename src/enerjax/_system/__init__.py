@@ -19,8 +19,11 @@ from .checks.values import direction_without_symmetry as direction_without_symme
 from .elements import Elements as Elements
 from .kinematics import (
     AbstractKinematics as AbstractKinematics,
+    ByRates as ByRates,
     Frames as Frames,
-    IdentityKinematics as IdentityKinematics,
+    mean_momentum as mean_momentum,
+    Rates as Rates,
+    RigidBodies as RigidBodies,
+    RigidKinematics as RigidKinematics,
 )
-from .rigid_bodies import RigidBodies as RigidBodies, RigidKinematics as RigidKinematics
 from .separable import System as System

@@ -4,10 +4,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float
 
-from .._programs import Indices
 from .._solvers import BlockDiagonal, hessian, in_blocks, Symmetric
 from .._types import Args, Coordinates, Scalar, Vector, Velocities
 from .base import (
@@ -26,8 +23,13 @@ from .base import (
     Symmetry,
 )
 from .canonical import HamiltonianSystem, LagrangianSystem
-from .kinematics import AbstractKinematics, ConfigurationKinematics, IdentityKinematics
-from .rigid_bodies import body_table, RigidBodies, RigidKinematics
+from .kinematics import (
+    AbstractKinematics,
+    body_table,
+    ConfigurationKinematics,
+    DirectorKinematics,
+    IdentityKinematics,
+)
 
 
 class System(AbstractSystem):
@@ -89,7 +91,6 @@ class System(AbstractSystem):
     driven: Driven | None
     symmetry: Symmetry | None
     redundant: bool = eqx.field(static=True)
-    rigid_bodies: Indices | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -134,12 +135,12 @@ class System(AbstractSystem):
         self.driven = driven
         self.symmetry = symmetry
         self.redundant = redundant
-        self.rigid_bodies = None if rigid_bodies is None else body_table(rigid_bodies)
-        self.kinematics = (
-            IdentityKinematics()
-            if kinematics is None
-            else ConfigurationKinematics(kinematics)
-        )
+        if rigid_bodies is not None:
+            self.kinematics = DirectorKinematics(body_table(rigid_bodies))
+        elif kinematics is not None:
+            self.kinematics = ConfigurationKinematics(kinematics)
+        else:
+            self.kinematics = IdentityKinematics()
 
     def __check_init__(self):
         check_functions(self, required="potential")
@@ -157,32 +158,6 @@ class System(AbstractSystem):
     def energy(self, state: State, args: Args = None) -> Scalar:
         """Total energy `1/2 v . M v + V(q)` of one state."""
         return self.kinetic_energy(state, args) + self.potential_energy(state, args)
-
-    def bodies(self, q: Coordinates) -> RigidBodies | None:
-        """The tables of the rigid bodies; `None` if there are none."""
-        if self.rigid_bodies is None:
-            return None
-        return RigidBodies(self.rigid_bodies.array, q.size)
-
-    def internal(self, q: Coordinates) -> Float[Array, " 6*bodies"]:
-        """The constraints that keep the directors of rigid bodies orthonormal."""
-        bodies = self.bodies(q)
-        return q[:0] if bodies is None else bodies.internal(q)
-
-    def inertia_of_rotations(
-        self, bodies: RigidBodies, args: Args, dtype: Any
-    ) -> Symmetric:
-        """`M` for the velocities of `RigidKinematics`, with one block for each body."""
-        kinematics, q = RigidKinematics(bodies), bodies.at_rest(dtype)
-
-        def energy(v: Velocities) -> Scalar:
-            rates = kinematics.lift(q, v, lambda q: q[None, :0], args)
-            return self.kinetic_energy(State(q, rates), args)
-
-        together = np.arange(bodies.num_velocities)
-        together[bodies.v] = bodies.v[:, :1]
-        at_rest = jnp.zeros((bodies.num_velocities,), dtype)
-        return hessian(energy, at_rest, together)
 
     def inertia(self, state: State, args: Args) -> Symmetric:
         """`M`, constant."""

@@ -14,7 +14,7 @@ from .._run.stage import free_flight, step_problem
 from .._run.step import model_for
 from .._run.step_sizes import End, EqualSteps
 from .._solvers import flattened, linearisable, Newton, RootFinder
-from .._system import AbstractSystem, RigidKinematics, State
+from .._system import AbstractSystem, State
 from .._types import Args, Scalar
 from ..schemes import AbstractScheme
 
@@ -147,14 +147,7 @@ def _coordinates(model: AbstractModel, start: State) -> str:
     count = start.q.size
     if not isinstance(model, SeparableModel):
         return f"{count} coordinates with {count} momenta"
-    if isinstance(model.kinematics, RigidKinematics):
-        bodies = model.kinematics.bodies
-        others = f", and {bodies.other_q.size} others" if bodies.other_q.size > 0 else ""
-        number = len(bodies.q)
-        return f"{number} rigid bodies, each moved by a translation and a rotation{others}"
-    if model.has_canonical_rates:
-        return f"{count} coordinates, whose rates are the velocities"
-    return f"{count} coordinates with {start.v.size} velocities v = L(q) qdot"
+    return model.kinematics.describe(start.q, start.v)
 
 
 def _chord(model: AbstractModel) -> str:

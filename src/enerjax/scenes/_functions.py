@@ -80,7 +80,7 @@ def constraint(layout: Layout, q: Coordinates, args: Parameters) -> Multipliers:
 def internal(layout: Layout, q: Coordinates) -> Multipliers:
     """The constraints between directors, which `System` adds after those of the scene."""
     table = layout.rigid_bodies
-    return q[:0] if table is None else RigidBodies(table, q.size).internal(q)
+    return q[:0] if table is None else RigidBodies(table, q.size).constraint(q)
 
 
 def driven(layout: Layout, q: Coordinates, t: Scalar, args: Parameters) -> Multipliers:

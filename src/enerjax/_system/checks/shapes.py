@@ -108,17 +108,10 @@ def check_shapes(system: AbstractSystem, state: State, args: Args) -> None:
 
 
 def _internal_rows(system: AbstractSystem, state: State) -> int:
-    """The number of constraints between the axes of rigid bodies; checks the indices."""
-    if not isinstance(system, System) or system.rigid_bodies is None:
+    """The number of constraints between the axes of rigid bodies."""
+    if not isinstance(system, System):
         return 0
-    table = system.rigid_bodies.array
-    if table.max(initial=-1) >= state.q.size:
-        raise ValueError(
-            f"`System(rigid_bodies=...)` holds the index {table.max()}, but `q` has "
-            f"{state.q.size} entries, with the indices 0 to {state.q.size - 1}. Each row "
-            "holds the indices of the mass centre and of the three axes of a body."
-        )
-    return 6 * len(table)
+    return jax.eval_shape(system.kinematics.constraint, state.q).size
 
 
 def energies(

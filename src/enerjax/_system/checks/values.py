@@ -3,15 +3,13 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from ..._programs import compiled, is_known
 from ..._solvers import blocks_of, Symmetric
-from ..._types import Args, Velocities
+from ..._types import Args
 from ..base import AbstractSystem, State
 from ..canonical import HamiltonianSystem, LagrangianSystem
-from ..rigid_bodies import RigidKinematics
 from ..separable import System
 from .shapes import describe, energies
 
@@ -81,30 +79,11 @@ def _is_quadratic(
 def _is_rigid(
     system: AbstractSystem, state: State, inertia: Symmetric, args: Args
 ) -> Array:
-    """Whether the kinetic energy of rigid bodies depends on their velocities in body axes
-    alone, as for a body with its mass centre as `x`."""
+    """Whether the kinetic energy is one of the coordinates' kind."""
     if not isinstance(system, System):
         return jnp.array(True)
-    bodies = system.bodies(state.q)
-    if bodies is None:
-        return jnp.array(True)
-    kinematics, random = RigidKinematics(bodies), np.random.default_rng(0)
-    count = bodies.num_velocities
-    probe = jnp.cos(jnp.arange(1, count + 1, dtype=state.v.dtype))
-
-    def rates() -> Velocities:
-        """Those of the probe where each body has a random rotation of its own."""
-        axes, _ = np.linalg.qr(random.normal(size=(len(bodies.q), 3, 3)))
-        axes = axes * np.linalg.det(axes)[:, None, None]
-        q = np.zeros(bodies.num_coordinates)
-        q[bodies.q[:, 3:]] = axes.reshape(-1, 9)
-        at = jnp.asarray(q, state.q.dtype)
-        return kinematics.lift(at, probe, lambda q: q[None, :0], args)
-
-    a, b = rates(), rates()
     energy = lambda v: system.kinetic_energy(State(state.q, v), args)
-    size = jnp.abs(a) @ jax.tree.map(jnp.abs, inertia) @ jnp.abs(a)
-    return jnp.abs(energy(a) - energy(b)) <= 1e3 * jnp.finfo(a.dtype).eps * size
+    return system.kinematics.has_inertia(energy, inertia)
 
 
 def check_values(system: AbstractSystem, state: State, args: Args) -> None:

@@ -1,0 +1,59 @@
+"""Coordinates whose rates are the velocities."""
+
+import jax.numpy as jnp
+
+from .base import AbstractFlatKinematics
+
+
+class AbstractPlainKinematics(AbstractFlatKinematics):
+    """`v = qdot`, with or without constraints between the coordinates."""
+
+    @property
+    def has_canonical_rates(self):
+        return True
+
+    def describe(self, q, v):
+        return f"{q.size} coordinates, whose rates are the velocities"
+
+    def with_blocks(self, q, relations, args):
+        return self
+
+    def metric(self, q, inertia, relations, args):
+        return inertia
+
+    def frames(self, q, jacobian, args):
+        return None
+
+    def push(self, qa, qb, step, args):
+        return step
+
+    def pull(self, qa, qb, force, args):
+        return force
+
+    def rates(self, q, v, jacobian, args):
+        return v
+
+    def lift(self, q, v, jacobian, args):
+        return v
+
+    def momentum_rows(self, q, momentum, args):
+        return momentum
+
+    def momentum_change(self, qa, qb, change, mean, step, args):
+        return change
+
+    def gyroscopic(self, q, momentum, rates, args):
+        return None
+
+
+class IdentityKinematics(AbstractPlainKinematics):
+    """Point masses, minimal coordinates with constant inertia."""
+
+    def has_inertia(self, energy, inertia):
+        return jnp.array(True)
+
+    def with_rotations(self, q):
+        return self
+
+    def constraint(self, q):
+        return q[:0]
