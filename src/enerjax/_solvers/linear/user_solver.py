@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
+import scipy
 from jaxtyping import Array, Float, PyTree
-from scipy.sparse import csr_array
 
 from ..._programs import shape_of
 from .banded import coloured_products, column_colours
@@ -127,9 +127,14 @@ class Sparse:
     It is constructed at trace time. Without a `pattern` all entries are stored.
     """
 
-    def __init__(self, solver: AbstractSparseSolver, pattern: csr_array | None, size: int):
+    def __init__(
+        self,
+        solver: AbstractSparseSolver,
+        pattern: "scipy.sparse.csr_array | None",
+        size: int,
+    ):
         if pattern is None:
-            pattern = csr_array(np.ones((size, size), bool))
+            pattern = scipy.sparse.csr_array(np.ones((size, size), bool))
         rows, columns = pattern.nonzero()
         order = np.lexsort((columns, rows))
         self.solver = solver
