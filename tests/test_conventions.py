@@ -20,7 +20,7 @@ TESTS = sorted(pathlib.Path(__file__).parent.glob("*.py"))
 LAYERS = [
     {"_types"},
     {"_programs"},
-    {"_results", "_discrete", "_solvers"},
+    {"_files", "_results", "_discrete", "_solvers"},
     {"_system"},
     {"_operators"},
     {"_analysis"},
