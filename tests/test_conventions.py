@@ -18,7 +18,7 @@ TESTS = sorted(pathlib.Path(__file__).parent.glob("*.py"))
 
 # The rooms of the package; each imports only from lower ones, which stand further up.
 LAYERS = [
-    {"_types"},
+    {"_types", "_progress"},
     {"_programs"},
     {"_files", "_results", "_discrete", "_solvers"},
     {"_system"},

@@ -1,5 +1,7 @@
 """The outcomes of a step. A failure is a value that each step of each lane returns."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -52,6 +54,25 @@ class RESULTS(eqx.Enumeration):
         "about 1e-14 of the coordinates. Or the motion has a singularity here, such as a "
         "collision."
     )
+    interrupted = (
+        "The run was interrupted. The same call with `resume=solution`, or with the same "
+        "`checkpoint`, makes the rest."
+    )
+
+
+# As they are written in files; an enumeration does not list its names.
+_NAMES = (
+    "successful",
+    "not_converged",
+    "singular",
+    "nonfinite",
+    "step_too_large",
+    "inconsistent_start",
+    "kappa_out_of_range",
+    "out_of_steps",
+    "steps_too_short",
+    "interrupted",
+)
 
 
 def first_failure(old: RESULTS, new: RESULTS) -> RESULTS:
@@ -83,6 +104,24 @@ def meanings(outcomes: RESULTS) -> np.ndarray:
     messages = [x.partition("<")[2].removesuffix(">") or "successful" for x in texts]
     words = np.array([x.partition(". ")[0].partition(":")[0] for x in messages])
     return words[positions].reshape(np.shape(codes))
+
+
+def names_of(outcomes: RESULTS) -> Any:
+    """The name of an outcome; of several the lists of their names."""
+    (codes,) = jax.tree.leaves(outcomes)
+    return np.array(_NAMES)[np.argsort(_codes())[np.asarray(codes)]].tolist()
+
+
+def from_names(names: Any) -> RESULTS:
+    """The inverse of `names_of`."""
+    codes = _codes()[np.vectorize(_NAMES.index, otypes=[int])(names)]
+    return jax.tree.map(lambda _: jnp.asarray(codes), RESULTS.successful)
+
+
+def _codes() -> np.ndarray:
+    """The code of each of the names."""
+    leaves = [jax.tree.leaves(getattr(RESULTS, name))[0] for name in _NAMES]
+    return np.array(leaves)
 
 
 def tally(outcomes: RESULTS) -> str:

@@ -22,5 +22,6 @@ from .kinematics import (
     Frames as Frames,
     IdentityKinematics as IdentityKinematics,
 )
+from .names import Names as Names
 from .rigid_bodies import RigidBodies as RigidBodies, RigidKinematics as RigidKinematics
 from .separable import System as System
