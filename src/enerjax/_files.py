@@ -31,8 +31,8 @@ def write_whole(target: Path, write: Callable[[BinaryIO], Any]) -> None:
 
 def write_arrays(target: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Writes an archive `.npz` of arrays without Python objects, and a checksum of them."""
-    word = np.array(checksum(arrays.values()))
-    write_whole(target, lambda file: np.savez(file, **arrays, **{_CHECKSUM: word}))
+    content: Any = {**arrays, _CHECKSUM: np.array(checksum(arrays.values()))}
+    write_whole(target, lambda file: np.savez(file, **content))
 
 
 def read_arrays(source: Path) -> dict[str, np.ndarray] | None:

@@ -12,6 +12,14 @@ from typing_extensions import TypeAliasType
 Progress = TypeAliasType("Progress", bool | Callable[[Any, Any], None])
 
 
+def check_progress(progress: Any) -> None:
+    if not (isinstance(progress, bool) or callable(progress)):
+        raise TypeError(
+            "`progress` must be `True`, or a function of what is done and of the whole, "
+            f"got {progress!r}."
+        )
+
+
 class Line:
     """A line of text on stderr, which terminals and notebooks overwrite again and again.
 

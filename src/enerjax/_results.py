@@ -109,19 +109,19 @@ def meanings(outcomes: RESULTS) -> np.ndarray:
 def names_of(outcomes: RESULTS) -> Any:
     """The name of an outcome; of several the lists of their names."""
     (codes,) = jax.tree.leaves(outcomes)
-    return np.array(_NAMES)[np.argsort(_codes())[np.asarray(codes)]].tolist()
+    known = {_code(name): name for name in _NAMES}
+    return jax.tree.map(lambda code: known[code], np.asarray(codes).tolist())
 
 
 def from_names(names: Any) -> RESULTS:
     """The inverse of `names_of`."""
-    codes = _codes()[np.vectorize(_NAMES.index, otypes=[int])(names)]
-    return jax.tree.map(lambda _: jnp.asarray(codes), RESULTS.successful)
+    codes = jax.tree.map(_code, names)
+    return jax.tree.map(lambda x: jnp.asarray(codes, x.dtype), RESULTS.successful)
 
 
-def _codes() -> np.ndarray:
-    """The code of each of the names."""
-    leaves = [jax.tree.leaves(getattr(RESULTS, name))[0] for name in _NAMES]
-    return np.array(leaves)
+def _code(name: str) -> int:
+    (code,) = jax.tree.leaves(getattr(RESULTS, name))
+    return int(code)
 
 
 def tally(outcomes: RESULTS) -> str:

@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from .._programs import at_top_level, checksum, digest, is_known
-from .._progress import Line, Progress
+from .._progress import check_progress, Line, Progress
 from .._results import RESULTS
 from .._types import Scalar
 from .pieces import begin_run, Carry, finish_run, piece
@@ -133,7 +134,7 @@ class _LongRun:
         used_up = self.attempts(sofar) >= self._max_attempts
         cause = RESULTS.out_of_steps if used_up else RESULTS.interrupted
         solution, reached = finish_run(
-            self._task, sofar.begin, padded, np.array(count), sofar.carry, cause
+            self._task, sofar.begin, padded, jnp.array(count), sofar.carry, cause
         )
         if solution.ts.size > self._num_rows:
             solution = first_rows(solution, self._num_rows)
@@ -197,11 +198,7 @@ def checked_wishes(
     progress: Any, checkpoint: Any, checkpoint_seconds: Any, resume: Any
 ) -> Wishes | None:
     """The checked arguments, or `None` for a run in one piece."""
-    if not (isinstance(progress, bool) or callable(progress)):
-        raise TypeError(
-            "`progress` must be `True`, or a function of the time that has passed in the "
-            f"motion and its duration, got {progress!r}."
-        )
+    check_progress(progress)
     if not (resume is None or isinstance(resume, Solution)):
         raise TypeError(
             f"`resume` must be a `Solution`, got {type(resume).__name__}. `enerjax.load` "

@@ -133,13 +133,13 @@ class Sparse:
         pattern: "scipy.sparse.csr_array | None",
         size: int,
     ):
-        if pattern is None:
-            pattern = scipy.sparse.csr_array(np.ones((size, size), bool))
-        rows, columns = pattern.nonzero()
+        full = np.ones((size, size), bool)
+        known: Any = scipy.sparse.csr_array(full) if pattern is None else pattern
+        rows, columns = known.nonzero()
         order = np.lexsort((columns, rows))
         self.solver = solver
         self.pattern = SparsePattern(size, rows[order], columns[order])
-        self._colours = column_colours(pattern, np.arange(shape_of(pattern)[1]))
+        self._colours = column_colours(known, np.arange(shape_of(known)[1]))
 
     def evaluate(
         self, fn: Callable[[Array], Array], x: Float[Array, " n"]

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ..._progress import Line, Progress
+from ..._progress import check_progress, Line, Progress
 from ..._run import positive_integer
 from .fingerprint import fingerprint
 from .grid import make_grid
@@ -71,6 +71,7 @@ def sweep(
     **Raises:** `ValueError` or `TypeError` for bad input, for a `fn` that returns anything
     but arrays, and if `path` holds another sweep or a damaged file.
     """
+    check_progress(progress)
     grid = make_grid(over)
     chunk = positive_integer("chunk", chunk)
     if batch_size is not None:
