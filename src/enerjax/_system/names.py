@@ -1,5 +1,6 @@
 """Names of the numbers of a run, for tables and files."""
 
+import collections
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -33,9 +34,9 @@ class Names(eqx.Module):
         given = coordinates, velocities, constraints
         together = [name for names in given[:2] for name in names or ()]
         for names in (together, list(constraints or ())):
-            twice = [name for name in names if names.count(name) > 1]
-            if twice:
-                raise ValueError(f"`Names`: '{twice[0]}' occurs twice.")
+            name, count = collections.Counter(names).most_common(1)[0] if names else ("", 0)
+            if count > 1:
+                raise ValueError(f"`Names`: '{name}' occurs {count} times.")
         self.coordinates, self.velocities, self.constraints = (
             None if names is None else tuple(map(str, names)) for names in given
         )
