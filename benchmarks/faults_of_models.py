@@ -174,7 +174,7 @@ FAULTS = (
     # Tools ------------------------------------------------------------------------------
     Fault(
         "sweeps: constants are not told",
-        "_tools/sweep/fingerprint.py",
+        "_programs/digest.py",
         "        tell(checksum([const]))\n",
         "        tell(np.shape(const))\n",
         "Sweeps that differ in a table of constants are taken for the same.",

@@ -18,9 +18,9 @@ TESTS = sorted(pathlib.Path(__file__).parent.glob("*.py"))
 
 # The rooms of the package; each imports only from lower ones, which stand further up.
 LAYERS = [
-    {"_types"},
+    {"_types", "_progress"},
     {"_programs"},
-    {"_results", "_discrete", "_solvers"},
+    {"_files", "_results", "_discrete", "_solvers"},
     {"_system"},
     {"_operators"},
     {"_analysis"},

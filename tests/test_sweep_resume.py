@@ -104,12 +104,12 @@ FINGERPRINT = """
 import enerjax as ej
 ej.enable_fast_loops()
 import jax
-from enerjax._tools.sweep.fingerprint import _digest
+from enerjax._programs import digest
 from tests.test_sweep_resume import stepped
 jax.config.update("jax_enable_x64", True)
 for derivative in (ej.Gonzalez(), ej.MeanValue()):
     fn = stepped(ej.EnergyPreserving(derivative=derivative), ej.Newton())
-    print(_digest(jax.jit(fn).trace(0.1).jaxpr))
+    print(digest(jax.jit(fn).trace(0.1).jaxpr))
 """
 
 

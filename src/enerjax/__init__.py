@@ -28,6 +28,8 @@ from ._run import (
     AbstractController as AbstractController,
     Audit as Audit,
     EqualSteps as EqualSteps,
+    load as load,
+    save as save,
     SaveAt as SaveAt,
     simulate as simulate,
     Solution as Solution,
@@ -46,6 +48,7 @@ from ._solvers import (
 from ._system import (
     AbstractSystem as AbstractSystem,
     Elements as Elements,
+    Names as Names,
     State as State,
     System as System,
 )

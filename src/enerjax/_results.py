@@ -1,5 +1,7 @@
 """The outcomes of a step. A failure is a value that each step of each lane returns."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -52,6 +54,25 @@ class RESULTS(eqx.Enumeration):
         "about 1e-14 of the coordinates. Or the motion has a singularity here, such as a "
         "collision."
     )
+    interrupted = (
+        "The run was interrupted. The same call with `resume=solution`, or with the same "
+        "`checkpoint`, makes the rest."
+    )
+
+
+# As they are written in files; an enumeration does not list its names.
+_NAMES = (
+    "successful",
+    "not_converged",
+    "singular",
+    "nonfinite",
+    "step_too_large",
+    "inconsistent_start",
+    "kappa_out_of_range",
+    "out_of_steps",
+    "steps_too_short",
+    "interrupted",
+)
 
 
 def first_failure(old: RESULTS, new: RESULTS) -> RESULTS:
@@ -83,6 +104,24 @@ def meanings(outcomes: RESULTS) -> np.ndarray:
     messages = [x.partition("<")[2].removesuffix(">") or "successful" for x in texts]
     words = np.array([x.partition(". ")[0].partition(":")[0] for x in messages])
     return words[positions].reshape(np.shape(codes))
+
+
+def names_of(outcomes: RESULTS) -> Any:
+    """The name of an outcome; of several the lists of their names."""
+    (codes,) = jax.tree.leaves(outcomes)
+    known = {_code(name): name for name in _NAMES}
+    return jax.tree.map(lambda code: known[code], np.asarray(codes).tolist())
+
+
+def from_names(names: Any) -> RESULTS:
+    """The inverse of `names_of`."""
+    codes = jax.tree.map(_code, names)
+    return jax.tree.map(lambda x: jnp.asarray(codes, x.dtype), RESULTS.successful)
+
+
+def _code(name: str) -> int:
+    (code,) = jax.tree.leaves(getattr(RESULTS, name))
+    return int(code)
 
 
 def tally(outcomes: RESULTS) -> str:

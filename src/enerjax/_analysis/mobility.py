@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-import scipy.linalg
+import scipy
 from jaxtyping import Array, Float
 
 from .._operators import make_model

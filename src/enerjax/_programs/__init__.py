@@ -1,8 +1,13 @@
 """Programs of JAX: tracing, sparsity, rewriting, and compiling into one function."""
 
 from . import primitives as primitives
-from .compiled import at_top_level as at_top_level, compiled as compiled
+from .compiled import (
+    at_top_level as at_top_level,
+    compiled as compiled,
+    Readable as Readable,
+)
 from .counting import num_operations as num_operations
+from .digest import checksum as checksum, digest as digest
 from .fast_loops import enable_fast_loops as enable_fast_loops
 from .lanes import in_any_lane as in_any_lane
 from .one_function.calls import in_one_function as in_one_function, unmerged as unmerged

@@ -2,12 +2,14 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
+import numpy as np
 from jax.core import Tracer
-from jaxtyping import PyTree
+from jax.extend.core import ClosedJaxpr
+from jaxtyping import Array, PyTree
 
 from .tracing import is_known
 
@@ -43,6 +45,46 @@ def compiled(fn: Callable[Arguments, Value]) -> Callable[Arguments, Value]:
             return within(*args, **kwargs)
 
     return call
+
+
+class Readable:
+    """`compiled(fn)` for calls outside of transformations, with a program to read.
+
+    `fn` returns a pytree of arrays.
+    """
+
+    def __init__(self, fn: Callable[..., PyTree[Array]]):
+        self._fn = fn
+
+    def __call__(self, *args: Any) -> PyTree[Array]:
+        return self._jitted(*_parts(args))
+
+    def program(self, *args: Any) -> ClosedJaxpr:
+        """The program that a call with these arguments runs; it is traced once for both."""
+        return self._jitted.trace(*_parts(args)).jaxpr
+
+    @functools.cached_property
+    def _jitted(self) -> Any:
+        def of_parts(static: _Static, arrays: list[Array]) -> PyTree[Array]:
+            inputs, (_, leaves), structure = iter(arrays), *static
+            values = (next(inputs) if x is None else x for x in leaves)
+            return self._fn(*jax.tree.unflatten(structure, values))
+
+        options = _QUICKLY if _are_known() else None
+        return jax.jit(of_parts, static_argnums=0, compiler_options=options)
+
+
+_Static: TypeAlias = tuple[tuple[tuple[Any, ...], tuple[Any, ...]], Any]
+
+
+def _parts(tree: PyTree[Any]) -> tuple[_Static, list[Array]]:
+    """What is static in a tree, which can be hashed, and its arrays."""
+    leaves, structure = jax.tree.flatten(tree)
+    is_array = [isinstance(x, jax.Array | np.ndarray | np.generic) for x in leaves]
+    arrays = [x for on, x in zip(is_array, leaves, strict=True) if on]
+    static = tuple(None if on else x for on, x in zip(is_array, leaves, strict=True))
+    # 1, 1.0 and True are equal, but make different programs.
+    return ((tuple(map(type, static)), static), structure), arrays
 
 
 _zero = jax.jit(lambda: 0.0)

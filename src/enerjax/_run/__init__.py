@@ -4,5 +4,6 @@ from .inputs import positive_integer as positive_integer
 from .saving import SaveAt as SaveAt
 from .simulate import simulate as simulate
 from .solution import Solution as Solution, Statistics as Statistics
+from .solution_file import load as load, save as save
 from .step import step as step, StepOutput as StepOutput, Warm as Warm
 from .step_sizes import AbstractController as AbstractController, EqualSteps as EqualSteps

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .._operators import AbstractModel
 from .._programs import is_known
@@ -212,6 +212,10 @@ class _ControlledPlan(AbstractPlan):
 
     def num_rejected(self, memory: _Memory) -> Count:
         return memory.num_rejected
+
+    @property
+    def numbers(self) -> PyTree[Any]:
+        return self.t0, self.t1, self.first_length, self.controller
 
     def rounded_up(self) -> "_ControlledPlan":
         # Its bound on the attempts does not depend on the length of the run.

@@ -34,6 +34,8 @@ def raise_failure(
         return solution
     num_completed = int(solution.stats.completed_steps)
     begin = float(reached)
+    if solution.result == RESULTS.interrupted:
+        raise Interrupted(solution, num_completed, begin)
     when = f"at t = {begin:.6g}"
     if h is not None:
         when = f"from t = {begin:.6g} to {begin + float(h):.6g}"
@@ -48,6 +50,19 @@ def raise_failure(
     if solution.result in (RESULTS.not_converged, RESULTS.singular, RESULTS.nonfinite):
         message += _dependent_rows(system, solution, args, begin)
     raise eqx.EquinoxRuntimeError(message + "(`throw=False` returns the run up to there.)")
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C in a run that is made piece by piece; `solution` is the run so far."""
+
+    def __init__(self, solution: Solution, num_completed: int, t: float):
+        super().__init__(
+            f"The run was interrupted after step {num_completed}, at t = {t:.6g}. The same "
+            "call with the same `checkpoint` makes the rest. Without a checkpoint the run "
+            "so far is the attribute `solution` of this error (in a notebook "
+            "`sys.last_value.solution`): pass it as `resume`."
+        )
+        self.solution = solution
 
 
 @contextlib.contextmanager

@@ -59,7 +59,7 @@ class Stepper(eqx.Module):
             multipliers=multipliers,
         )
 
-    def attempt(self, before: Progress, live: Flag) -> tuple[Progress, "_Attempt"]:
+    def attempt(self, before: Progress, live: Flag) -> tuple[Progress, "Attempt"]:
         """Attempts one step. If `live` is false nothing changes, at no cost."""
         model, plan = self.model, self.plan
         place, length = plan.next(before.memory, before.place)
@@ -91,7 +91,7 @@ class Stepper(eqx.Module):
             multipliers=keep(out.multipliers, before.multipliers),
         )
         zero_unless = lambda flag, x: jnp.where(flag, x, jnp.zeros_like(x))
-        return after, _Attempt(
+        return after, Attempt(
             energies=jax.tree.map(lambda x: zero_unless(good, x), out.energies),
             details=out.details,
             costs=Costs(
@@ -104,7 +104,7 @@ class Stepper(eqx.Module):
         )
 
 
-class _Attempt(eqx.Module):
+class Attempt(eqx.Module):
     """The report of one attempted step; the energies of a rejected one are zero."""
 
     energies: Energies
@@ -136,7 +136,7 @@ def run_loop(
         num_groups, steps_in_group, None if plan.is_counted else is_done
     )
 
-    def one_step(progress: Progress, live: Flag) -> tuple[Progress, _Attempt]:
+    def one_step(progress: Progress, live: Flag) -> tuple[Progress, Attempt]:
         return stepper.attempt(progress, live & ~is_done(progress))
 
     def one_group(before: Progress, live: Flag) -> tuple[Progress, Record]:

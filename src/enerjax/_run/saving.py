@@ -14,7 +14,7 @@ from typing_extensions import TypeAliasType
 from .._operators import AbstractModel
 from .._programs import is_known
 from .._system import State
-from .._types import Args, Count, Multipliers, Scalar, Times, Vector
+from .._types import Args, Count, Flag, Multipliers, Scalar, Times, Vector
 from ..schemes import Energies
 from .collocation import state_within
 from .inputs import positive_integer
@@ -176,6 +176,21 @@ class Rows(eqx.Module):
     costs: Costs
 
 
+class Standing(eqx.Module):
+    """Where a run stands between two steps; the places are those of `AbstractPlan`.
+
+    - `completed`: the number of accepted steps.
+    - `begin`: the place where the group of steps began that is not closed yet.
+    - `place`: the place that is reached.
+    - `next`: the place where the next step is going to end.
+    """
+
+    completed: Count
+    begin: Scalar
+    place: Scalar
+    next: Scalar
+
+
 class AbstractSaving(eqx.Module):
     """How rows are made from the states that the loop keeps.
 
@@ -196,18 +211,27 @@ class AbstractSaving(eqx.Module):
     def rows(self, run: RecordedRun) -> Rows:
         """The rows; those that the run did not reach are NaN."""
 
+    @abc.abstractmethod
+    def is_due(self, plan: AbstractPlan, standing: Standing) -> Flag:
+        """Whether the open group must end here, in a run whose groups have any length."""
+
+    def of_groups(self) -> "AbstractSaving":
+        """The saving that makes the same rows of groups that ended where they were due."""
+        return self
+
 
 def saving_of(
-    saveat: SaveAt, plan: AbstractPlan, controller: AbstractController
+    saveat: SaveAt, plan: AbstractPlan, controller: AbstractController, max_every: int
 ) -> AbstractSaving:
+    """The saving of a run; steps between rows that exceed `max_every` are not needed."""
     if saveat.ts is not None:
         return _AtTimes(_as_times(saveat.ts, plan))
     if saveat.t1 or (saveat.every is None and not plan.is_counted):
         return _AtBothEnds()
     every = 1 if saveat.every is None else positive_integer("every", saveat.every)
     if isinstance(controller, EqualSteps):
-        return _EveryEqualStep(min(every, plan.max_attempts))
-    return _EveryAcceptedStep(min(every, plan.max_attempts))
+        return _EveryEqualStep(min(every, max_every))
+    return _EveryAcceptedStep(min(every, max_every))
 
 
 class _AtBothEnds(AbstractSaving):
@@ -225,6 +249,9 @@ class _AtBothEnds(AbstractSaving):
         plan, record = run.plan, run.record
         at_end = record.reached & (record.place >= plan.last)
         return _after_start(run.begin, record, at_end, jnp.stack([plan.t0, plan.t1]))
+
+    def is_due(self, plan: AbstractPlan, standing: Standing) -> Flag:
+        return jnp.array(False)
 
 
 class _EveryEqualStep(AbstractSaving):
@@ -246,6 +273,9 @@ class _EveryEqualStep(AbstractSaving):
         is_used = numbers - self.every < plan.last
         ts = jnp.where(is_used, jax.vmap(plan.time)(numbers), jnp.nan)
         return _after_start(run.begin, record, record.reached, ts)
+
+    def is_due(self, plan: AbstractPlan, standing: Standing) -> Flag:
+        return standing.completed % self.every == 0
 
 
 class _EveryAcceptedStep(AbstractSaving):
@@ -273,6 +303,12 @@ class _EveryAcceptedStep(AbstractSaving):
         times = jax.vmap(plan.time)(picked.place)
         ts = jnp.append(plan.t0, jnp.where(is_used, times, jnp.nan))
         return _after_start(run.begin, picked, is_used, ts)
+
+    def is_due(self, plan: AbstractPlan, standing: Standing) -> Flag:
+        return standing.completed % self.every == 0
+
+    def of_groups(self) -> "_EveryAcceptedStep":
+        return _EveryAcceptedStep(1)
 
 
 class _AtTimes(AbstractSaving):
@@ -324,6 +360,14 @@ class _AtTimes(AbstractSaving):
             energies=_nan_unless(valid, energies),
             costs=record.costs.by_segment(segment, ts.size),
         )
+
+    def is_due(self, plan: AbstractPlan, standing: Standing) -> Flag:
+        # A step with a time inside is a group of its own, and so are those beside it: the
+        # time of a row at the end of a step is known to round-off only.
+        places = (self.times - plan.t0) / plan.unit
+        room = standing.next - standing.place
+        first = jnp.searchsorted(places, standing.begin - room)
+        return first < jnp.searchsorted(places, standing.next + room, side="right")
 
 
 def _states_within(

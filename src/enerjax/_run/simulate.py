@@ -1,26 +1,23 @@
 """Whole runs."""
 
 import dataclasses
-from typing import Any
-
-import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jaxtyping import PyTree
+import os
+import sys
 
 from .._programs import at_top_level, compiled
+from .._progress import Progress
 from .._solvers import Newton, RootFinder
 from .._system import AbstractSystem, State
 from .._types import Args, Real, Scalar
 from ..schemes import AbstractScheme
-from .audit import audit, Measures, measures
 from .failure import explained_memory_error, raise_failure
 from .inputs import check_halvings, prepare
-from .loop import run_loop, Stepper
-from .saving import AbstractSaving, RecordedRun, SaveAt, SaveFunction, saving_of
-from .solution import first_rows, Solution, Statistics
-from .step import model_for
-from .step_sizes import AbstractController, AbstractPlan, EqualSteps, find_end
+from .long_run import checked_wishes, run_long
+from .loop import run_loop
+from .saving import RecordedRun, SaveAt, saving_of
+from .solution import first_rows, Solution
+from .step_sizes import AbstractController, EqualSteps, find_end
+from .task import Task
 
 
 def simulate(
@@ -38,6 +35,10 @@ def simulate(
     max_steps: int | None = None,
     root_finder: RootFinder = Newton(),
     max_halvings: int | None = None,
+    progress: Progress = False,
+    checkpoint: str | os.PathLike | None = None,
+    checkpoint_seconds: Real = 60.0,
+    resume: Solution | None = None,
     throw: bool = True,
 ) -> Solution:
     """Integrate `num_steps` steps of length `h` from `start`, or until the time `t1`.
@@ -77,93 +78,85 @@ def simulate(
       steps, for which the energy identity holds as well; 0 disables this. The default is 3
       for systems with many unknowns, else 0, because it lengthens the compilation.
       `stats.halvings` shows where steps were divided.
+    - `progress`: `True` for a line on stderr that shows how far the run is, or a function
+      that is called with the time that has passed in the motion and its duration.
+    - `checkpoint`: a file in which the run so far is kept. If it exists, the run continues
+      from there: after an interruption make the same call again. `load` reads it at any
+      time.
+    - `checkpoint_seconds`: how often the file is written (seconds of the clock). It is also
+      written at the end, and rarer if writing takes long.
+    - `resume`: a solution of the same run to an earlier end, whose steps are not repeated.
+      The result is the same to the last bit as without `resume`. The other arguments must
+      be the same, but for the end (`num_steps`, which counts all steps, or `t1` with equal
+      steps) and `max_steps`.
     - `throw`: raise an error at the end of a failed run, which names the step, the time and
       the cause (under `jit`, `vmap` and `grad` only the cause, and for all lanes at once).
       With `False` check `result`: rows after the failure are NaN.
 
+    With `progress`, `checkpoint` or `resume` a run is made piece by piece. Its program is
+    another one than that of a plain run, with which it agrees to round-off; among such runs
+    equal steps are equal to the last bit. Ctrl-C then ends it after the current piece, in
+    about half a second. These three are for single runs outside of `jit`, `vmap` and
+    derivatives.
+
     **Returns:** a `Solution`.
 
     **Raises:** `ValueError` or `TypeError` for bad input, before any step;
-    `equinox.EquinoxRuntimeError` for a failed run if `throw`.
+    `equinox.EquinoxRuntimeError` for a failed run if `throw`. `KeyboardInterrupt` for an
+    interrupted run that is made piece by piece, with the run so far as its attribute
+    `solution`; without `throw` this is returned. `ValueError` for a file or solution of
+    another run.
     """
     if not isinstance(saveat, SaveAt):
         raise TypeError(f"`saveat` must be a `SaveAt`, got {saveat!r}.")
     check_halvings(max_halvings)
+    wishes = checked_wishes(progress, checkpoint, checkpoint_seconds, resume)
     start, args, step, begin = prepare(system, scheme, start, args, h, t0, root_finder)
     end = find_end(num_steps, t1, max_steps, controller, h, t0, step.dtype)
     plan = controller.plan(scheme, step, begin, end)
-    saving = saving_of(saveat, plan, controller)
-    task = _Task(
+    longest = plan.max_attempts if wishes is None else sys.maxsize
+    task = Task(
         system=system,
         scheme=scheme,
         start=start,
         args=args,
         plan=plan,
-        saving=saving,
+        saving=saving_of(saveat, plan, controller, longest),
         fn=saveat.fn,
         root_finder=root_finder,
         max_halvings=max_halvings,
     )
-    if at_top_level(task):
-        task = dataclasses.replace(task, plan=plan.rounded_up())
+    num_rows = task.saving.num_rows(plan)
     with explained_memory_error(plan.max_attempts):
-        solution, reached = _run(task)
-    if solution.ts.size > saving.num_rows(plan):
-        solution = first_rows(solution, saving.num_rows(plan))
+        if wishes is None:
+            solution, reached = _whole(task, num_rows)
+        else:
+            solution, reached = run_long(task, num_rows, wishes)
     if not throw:
         return solution
     equal = plan.unit if isinstance(controller, EqualSteps) else None
     return raise_failure(solution, system, args, reached, equal)
 
 
-class _Task(eqx.Module):
-    """The checked arguments of `simulate`."""
-
-    system: AbstractSystem
-    scheme: AbstractScheme
-    start: State
-    args: Args
-    plan: AbstractPlan
-    saving: AbstractSaving
-    fn: SaveFunction | None
-    root_finder: RootFinder
-    max_halvings: int | None
+def _whole(task: Task, num_rows: int) -> tuple[Solution, Scalar]:
+    """A run in one piece, and the time that it has reached."""
+    if at_top_level(task):
+        task = dataclasses.replace(task, plan=task.plan.rounded_up())
+    solution, reached = _run(task)
+    if solution.ts.size > num_rows:
+        solution = first_rows(solution, num_rows)
+    return solution, reached
 
 
 @compiled
-def _run(task: _Task) -> tuple[Solution, Scalar]:
-    """The run, and the time that it has reached."""
-    plan, saving, fn = task.plan, task.saving, task.fn
-    model = model_for(task.scheme, task.system, task.start, task.args)
-
-    def observe(state: State, t: Scalar) -> tuple[PyTree[Any], Measures]:
-        """The user's form of a state, or the value of `fn`, and its part of the audit.
-
-        The state is one of `model.in_rates`.
-        """
-        value: PyTree[Any] = model.in_rates.to_user(state)
-        if fn is not None:
-            value = jax.tree.map(jnp.asarray, fn(t, value, task.args))
-        timed = State(state.q, state.v, t if task.system.is_timed else None)
-        return value, measures(model.in_rates, timed)
-
-    # With `fn` states are observed in the loop, so that they need not be stored. Otherwise
-    # they are observed together after the loop, which is faster.
-    in_loop = fn is not None and saving.keeps_rows
-
-    def keep(state: State, place: Scalar) -> PyTree[Any]:
-        kept = model.to_rates(state)
-        return observe(kept, plan.time(place)) if in_loop else kept
-
-    stepper = Stepper(
-        scheme=task.scheme,
-        model=model,
-        plan=plan,
-        root_finder=task.root_finder,
-        max_halvings=task.max_halvings,
-    )
+def _run(task: Task) -> tuple[Solution, Scalar]:
+    """The program of a run in one piece."""
+    plan, saving, stepper = task.plan, task.saving, task.stepper()
+    model = stepper.model
     start = model.to_internal(task.start)
-    begin, end, record = run_loop(stepper, start, saving.steps_in_group(plan), keep)
+    begin, end, record = run_loop(
+        stepper, start, saving.steps_in_group(plan), task.keep(model)
+    )
     run = RecordedRun(
         model=model.in_rates,
         plan=plan,
@@ -172,23 +165,4 @@ def _run(task: _Task) -> tuple[Solution, Scalar]:
         completed=end.completed,
         order=task.scheme.order,
     )
-    rows = saving.rows(run)
-    ys, measured = rows.kept if in_loop else jax.vmap(observe)(rows.kept, rows.ts)
-    solution = Solution(
-        ts=rows.ts,
-        ys=ys,
-        multipliers=jax.vmap(model.user_multipliers)(rows.multipliers),
-        details=rows.details,
-        audit=audit(measured, rows.energies),
-        stats=Statistics(
-            newton_iterations=rows.costs.iterations,
-            residual=rows.costs.residual,
-            halvings=rows.costs.halvings,
-            local_error=rows.costs.local_error,
-            completed_steps=end.completed,
-            rejected_steps=plan.num_rejected(end.memory),
-        ),
-        end=model.to_user(end.state),
-        result=end.result,
-    )
-    return solution, plan.time(end.place)
+    return task.solution(model, saving.rows(run), end), plan.time(end.place)

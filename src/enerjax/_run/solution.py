@@ -1,16 +1,19 @@
+import os
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
 from .._programs import compiled, is_known
 from .._results import RESULTS, tally
-from .._system import State
+from .._system import Names, State
 from .._types import Count, Scalar
 from .audit import Audit
+from .tables import data_frame, dataset, table, write_csv
 
 
 class Statistics(eqx.Module):
@@ -41,6 +44,18 @@ class Statistics(eqx.Module):
     rejected_steps: Count | None = None
 
 
+class Continuation(eqx.Module):
+    """What a run needs to be continued to the last bit: see `resume` of `simulate`.
+
+    - `numbers`: the start of the run, its groups of steps, the unfinished group, and the
+      memories of predictor, Newton's method and step controller.
+    - `run`: one word for each property of the run that must not change.
+    """
+
+    numbers: tuple[Array | np.ndarray, ...]
+    run: tuple[tuple[str, str], ...] = eqx.field(static=True)
+
+
 class Solution(eqx.Module):
     """A run. Every array has a leading axis of saved times.
 
@@ -59,6 +74,9 @@ class Solution(eqx.Module):
     - `end`: the last state that was reached, after `stats.completed_steps` steps: the last
       row, or the state in which a failed step began. A further run can start from it.
     - `result`: `RESULTS.successful`, or the first failure.
+    - `names`: those of the system, for tables.
+    - `continuation`: what the next step needs, of a run with `progress`, `checkpoint` or
+      `resume`; else `None`.
 
     Rows after a failed step are NaN; the rows before it are not affected.
 
@@ -69,7 +87,8 @@ class Solution(eqx.Module):
     exact only between rows at the ends of steps, such as all rows of `SaveAt(every=...)`.
 
     `print` shows the outcome, the number of steps and iterations, and the audit; for a
-    batch, all lanes together.
+    batch, all lanes together. `to_csv`, `to_pandas` and `to_xarray` make tables, and
+    `enerjax.save` writes everything to a file.
     """
 
     ts: Float[Array, " times"]
@@ -80,6 +99,8 @@ class Solution(eqx.Module):
     stats: Statistics
     end: State
     result: RESULTS
+    names: Names | None = None
+    continuation: Continuation | None = None
 
     @property
     def phase_error(self) -> Scalar:
@@ -95,6 +116,54 @@ class Solution(eqx.Module):
         largest = jnp.maximum(jnp.nanmax(kinetic, axis=-1), rest)
         total = jnp.sum(self.stats.local_error, axis=-1)
         return total / jnp.sqrt(2 * jnp.where(largest > 0, largest, jnp.inf))
+
+    def to_csv(
+        self, path: str | os.PathLike, columns: Mapping[str, ArrayLike] | None = None
+    ) -> None:
+        """Write the rows to a file of comma-separated values, with 17 digits.
+
+        The columns are those of `to_pandas`; pandas is not needed.
+
+        **Arguments:**
+
+        - `path`: the name of the file.
+        - `columns`: see `to_pandas`.
+
+        **Raises:** `ValueError` for a batch of runs, and for columns of another length.
+        """
+        write_csv(path, table(self, columns))
+
+    def to_pandas(self, columns: Mapping[str, ArrayLike] | None = None) -> Any:
+        """A `pandas.DataFrame` with one line for each row, and the time `t` as index.
+
+        The columns are the coordinates and velocities by name (or the values of
+        `SaveAt(fn=...)`), `multiplier.NAME` of each constraint, the entries of the audit,
+        and those of the statistics and of `details`, which belong to the steps since the
+        row before. Rows that the run has not reached are left out.
+
+        **Arguments:**
+
+        - `columns`: arrays of shape `(times, ...)` by name, in place of coordinates,
+          velocities and multipliers. Those of a scene are `scene.columns(solution)`: poses
+          of bodies, lengths and angles of parts, forces and reactions.
+
+        **Raises:** `ImportError` without pandas (the extra `tables`); `ValueError` for a
+        batch of runs, and for columns of another length.
+        """
+        return data_frame(table(self, columns))
+
+    def to_xarray(self) -> Any:
+        """An `xarray.Dataset` with the dimensions `t`, `coordinate`, `velocity`,
+        `constraint` and `symmetry`, and names as their coordinates.
+
+        Its variables are `q`, `v`, `multipliers`, the entries of the audit, `details` and
+        the statistics. The outcome of the run is among its `attrs`. Rows that the run has
+        not reached are left out.
+
+        **Raises:** `ImportError` without xarray (the extra `tables`); `ValueError` for a
+        batch of runs.
+        """
+        return dataset(self)
 
     def __str__(self) -> str:
         return _report(self) if is_known(self) else repr(self)
@@ -123,6 +192,7 @@ def first_rows(solution: Solution, count: int) -> Solution:
         stats=eqx.tree_at(per_row, stats, cut(per_row(stats), count - 1)),
         end=solution.end,
         result=solution.result,
+        names=solution.names,
     )
 
 

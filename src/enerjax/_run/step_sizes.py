@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import sys
 from typing import Any
 
 import equinox as eqx
@@ -96,6 +97,18 @@ class AbstractPlan(eqx.Module):
         `max_attempts` is rounded up to a power of two. Attempts that are not needed cost
         next to nothing.
         """
+
+    @property
+    @abc.abstractmethod
+    def numbers(self) -> PyTree[Any]:
+        """The numbers that all steps depend on.
+
+        Runs with the same numbers make the same steps, up to the end of the shorter one.
+        """
+
+    def unlimited(self) -> "AbstractPlan":
+        """The same steps, without a limit on their number."""
+        return dataclasses.replace(self, max_attempts=sys.maxsize, is_counted=False)
 
 
 class AbstractController(eqx.Module):
@@ -192,6 +205,10 @@ class _EqualPlan(AbstractPlan):
 
     def num_rejected(self, memory: None) -> None:
         return None
+
+    @property
+    def numbers(self) -> PyTree[Any]:
+        return self.t0, self.unit
 
     def rounded_up(self) -> "_EqualPlan":
         room = 1 << (self.max_attempts - 1).bit_length()

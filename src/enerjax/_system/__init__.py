@@ -26,4 +26,5 @@ from .kinematics import (
     RigidBodies as RigidBodies,
     RigidKinematics as RigidKinematics,
 )
+from .names import Names as Names
 from .separable import System as System

@@ -30,6 +30,7 @@ from typing_extensions import TypeAliasType
 
 from .._solvers import Symmetric
 from .._types import Args, Coordinates, JointMultipliers, Multipliers, Scalar, Velocities
+from .names import Names
 
 
 def inexact(x: Any) -> Array:
@@ -81,6 +82,7 @@ class AbstractSystem(eqx.Module):
     driven: eqx.AbstractVar[Driven | None]
     symmetry: eqx.AbstractVar[Symmetry | None]
     redundant: eqx.AbstractVar[bool]
+    names: eqx.AbstractVar[Names | None]
 
     @property
     def is_timed(self) -> bool:

@@ -21,6 +21,7 @@ from .base import (
     State,
     Symmetry,
 )
+from .names import Names
 
 
 class AbstractCanonicalSystem(AbstractSystem):
@@ -55,6 +56,7 @@ class LagrangianSystem(AbstractCanonicalSystem):
     driven: Driven | None = None
     symmetry: Symmetry | None = None
     redundant: bool = eqx.field(default=False, static=True)
+    names: Names | None = None
 
     def __check_init__(self):
         check_function("kinetic", self.kinetic, "(q, qdot, args)")
@@ -96,6 +98,7 @@ class HamiltonianSystem(AbstractCanonicalSystem):
     driven: Driven | None = None
     symmetry: Symmetry | None = None
     redundant: bool = eqx.field(default=False, static=True)
+    names: Names | None = None
 
     def __check_init__(self):
         check_functions(self, required="hamiltonian")

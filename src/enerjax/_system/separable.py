@@ -30,6 +30,7 @@ from .kinematics import (
     DirectorKinematics,
     IdentityKinematics,
 )
+from .names import Names
 
 
 class System(AbstractSystem):
@@ -74,6 +75,7 @@ class System(AbstractSystem):
       unknowns each, and conserve angular momentum to round-off where rotations change
       neither the potential nor the constraints. Other schemes impose six constraints on
       each body, whose multipliers follow those of `constraint`.
+    - `names`: names of coordinates, velocities and constraints for tables; see `Names`.
 
     `args` is any pytree; the functions must be smooth and written with `jax.numpy`.
 
@@ -91,6 +93,7 @@ class System(AbstractSystem):
     driven: Driven | None
     symmetry: Symmetry | None
     redundant: bool = eqx.field(static=True)
+    names: Names | None
 
     def __init__(
         self,
@@ -105,6 +108,7 @@ class System(AbstractSystem):
         symmetry: Symmetry | None = None,
         redundant: bool = False,
         rigid_bodies: Any = None,
+        names: Names | None = None,
     ):
         if rigid_bodies is not None and kinematics is not None:
             raise ValueError(
@@ -135,6 +139,7 @@ class System(AbstractSystem):
         self.driven = driven
         self.symmetry = symmetry
         self.redundant = redundant
+        self.names = names
         if rigid_bodies is not None:
             self.kinematics = DirectorKinematics(body_table(rigid_bodies))
         elif kinematics is not None:
@@ -176,6 +181,7 @@ class System(AbstractSystem):
         driven: Driven | None = None,
         symmetry: Symmetry | None = None,
         redundant: bool = False,
+        names: Names | None = None,
     ) -> LagrangianSystem:
         """A system whose inertia depends on its coordinates.
 
@@ -192,7 +198,7 @@ class System(AbstractSystem):
         - `constraint`: `constraint(q, args)`, a vector that vanishes in every admissible
           configuration. Leave it out if there is none.
         - `force`: `force(q, qdot, t, args)`, shape `(nq,)`, conjugate to `qdot`.
-        - `driven`: `driven(q, t, args)`; `symmetry`, `redundant`: see `System`.
+        - `driven`: `driven(q, t, args)`; `symmetry`, `redundant`, `names`: see `System`.
 
         **Returns:** a system that all functions accept like a `System`; the `v` of a
         `State` is `qdot`, shape `(nq,)`.
@@ -205,6 +211,7 @@ class System(AbstractSystem):
             driven=driven,
             symmetry=symmetry,
             redundant=redundant,
+            names=names,
         )
 
     @staticmethod
@@ -216,6 +223,7 @@ class System(AbstractSystem):
         driven: Driven | None = None,
         symmetry: Symmetry | None = None,
         redundant: bool = False,
+        names: Names | None = None,
     ) -> HamiltonianSystem:
         """A system given by its Hamiltonian.
 
@@ -231,8 +239,8 @@ class System(AbstractSystem):
         - `constraint`: as for `from_lagrangian`. It is enforced for `q`, and
           `B(q) dH/dp = 0` for `p`.
         - `force`: `force(q, qdot, t, args)`, shape `(nq,)`, conjugate to `qdot = dH/dp`.
-        - `driven`: `driven(q, t, args)`; `symmetry` (rows of `qdot`), `redundant`: see
-          `System`.
+        - `driven`: `driven(q, t, args)`; `symmetry` (rows of `qdot`), `redundant`,
+          `names`: see `System`.
 
         **Returns:** a system that all functions accept like a `System`; the `v` of a
         `State` is the momentum `p`, shape `(nq,)`. The audit counts `H(q, 0)` as potential
@@ -245,4 +253,5 @@ class System(AbstractSystem):
             driven=driven,
             symmetry=symmetry,
             redundant=redundant,
+            names=names,
         )

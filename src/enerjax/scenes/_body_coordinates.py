@@ -38,6 +38,11 @@ class AbstractBodyCoordinates(abc.ABC):
     def num_velocities(self) -> int:
         return self.num_coordinates - self.num_redundant
 
+    @property
+    @abc.abstractmethod
+    def names(self) -> tuple[list[str], list[str]]:
+        """The names of the coordinates and of the velocities."""
+
     def origin(self, q: Coordinates) -> Point:
         """The mass centre in space."""
         return q[: self.dimension]
@@ -67,6 +72,15 @@ class AbstractBodyCoordinates(abc.ABC):
         return v
 
 
+# The axes of space.
+AXES = ("x", "y", "z")
+
+
+def _of_centre(dimension: int) -> tuple[list[str], list[str]]:
+    axes = AXES[:dimension]
+    return [*axes], [f"v{axis}" for axis in axes]
+
+
 def translation(v: Velocities, numbers: Numbers) -> Scalar:
     return 0.5 * numbers["mass"] * jnp.sum(v**2)
 
@@ -82,6 +96,10 @@ class Points(AbstractBodyCoordinates):
     def num_coordinates(self) -> int:
         return self.dimension
 
+    @property
+    def names(self):
+        return _of_centre(self.dimension)
+
     def kinetic(self, v, numbers):
         return translation(v, numbers)
 
@@ -96,6 +114,11 @@ class PlanarBodies(AbstractBodyCoordinates):
     @property
     def num_coordinates(self) -> int:
         return 3
+
+    @property
+    def names(self):
+        q, v = _of_centre(2)
+        return [*q, "angle"], [*v, "angle_rate"]
 
     def axes(self, q):
         c, s = jnp.cos(q[2]), jnp.sin(q[2])
@@ -119,6 +142,12 @@ class DirectorBodies(AbstractBodyCoordinates):
     @property
     def num_coordinates(self) -> int:
         return 12
+
+    @property
+    def names(self):
+        q, v = _of_centre(3)
+        axes = [f"axis{k}_{axis}" for k in (1, 2, 3) for axis in AXES]
+        return [*q, *axes], [*v, *(f"{name}_rate" for name in axes)]
 
     def axes(self, q):
         return q[3:].reshape(3, 3)
@@ -160,6 +189,11 @@ class QuaternionBodies(AbstractBodyCoordinates):
     @property
     def num_coordinates(self) -> int:
         return 7
+
+    @property
+    def names(self):
+        q, v = _of_centre(3)
+        return [*q, "p0", "p1", "p2", "p3"], [*v, "omega1", "omega2", "omega3"]
 
     def axes(self, q):
         return rotation(q[3:]).T

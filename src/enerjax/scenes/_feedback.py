@@ -57,8 +57,12 @@ class Moving(View):
         measure = measure_of(self.layout, name)
         group, numbers = link_of(self.layout, name, self._args)
         group = group._replace(law=measure)
-        value = lambda view: evaluate(group, view, numbers)[0]
-        return value(self), self._rate_of(value)
+        return self.with_rate(lambda view: evaluate(group, view, numbers)[0])
+
+    def with_rate(self, value: Callable[[View], Array]) -> tuple[Array, Array]:
+        """A quantity and its rate."""
+        of_q = lambda x: value(View(self.layout, x))
+        return jax.jvp(of_q, (self.q,), (lift(self.layout, self.q, self.v),))
 
     def _value(self, name: str, *, is_angle: bool) -> Scalar:
         kinds = measures_of(self.layout).items()
@@ -72,8 +76,7 @@ class Moving(View):
         return isinstance(name, str) and name not in self.layout.numbers_of_bodies
 
     def _rate_of(self, value: Callable[[View], Array]) -> Array:
-        of_q = lambda x: value(View(self.layout, x))
-        return jax.jvp(of_q, (self.q,), (lift(self.layout, self.q, self.v),))[1]
+        return self.with_rate(value)[1]
 
 
 def measure_of(layout: Layout, name: str) -> AbstractMeasure:

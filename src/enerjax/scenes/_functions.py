@@ -3,13 +3,15 @@
 All parts of a kind are evaluated together, from tables of their numbers.
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._system import RigidBodies, System
+from .._system import Names, RigidBodies, System
 from .._types import Coordinates, Multipliers, Scalar, Velocities
 from ._feedback import Moving
 from ._laws import AbstractForceLaw, Acting, Driven
@@ -19,8 +21,10 @@ from ._pose_view import evaluate, lift, rows, View
 from ._user_functions import ask, vector_of
 
 
-def make_system(layout: Layout, over_constrained: bool) -> System:
+def make_system(layout: Layout, over_constrained: bool, row_names: Sequence[str]) -> System:
     """The system of a scene; its `args` are `Parameters`."""
+    names = [(body, kind.names) for body, kind in layout.bodies]
+    q, v = ([f"{body}.{x}" for body, own in names for x in own[k]] for k in (0, 1))
     redundant = any(group.kind.num_redundant for group in layout.body_groups)
     return System(
         eqx.Partial(kinetic, layout),
@@ -32,6 +36,7 @@ def make_system(layout: Layout, over_constrained: bool) -> System:
         driven=eqx.Partial(driven, layout) if layout.drives else None,
         redundant=over_constrained,
         rigid_bodies=layout.rigid_bodies,
+        names=Names(q, v, row_names),
     )
 
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._analysis import ConsistentStart, Equilibrium, freedoms, Mobility
@@ -12,9 +13,10 @@ from .._programs import is_known
 from .._run import Solution
 from .._system import State, System
 from .._types import Coordinates, Real, Vector
+from ._columns import of_bodies, of_reaction, of_readout
 from ._compile import compile_parts, join, sort_parts
 from ._constraint_rows import check_reacting, row_names, rows_of
-from ._feedback import Moving
+from ._feedback import measures_of, Moving
 from ._functions import make_system
 from ._gaps import Gap, Measured
 from ._law_checks import check_laws
@@ -87,10 +89,11 @@ class Scene:
             for part in found[kind]
         }
         self._kinds = {part.name: type(part).__name__ for part in parts}
-        self.system = make_system(self._layout, redundant)
         self.q, self.v = (join([getattr(b, x) for b in bodies]) for x in ("q", "v"))
         check_laws(self._layout, self.q, self.args)
         self._rows = rows_of(self._layout, self.q, self.args)
+        names = row_names(self._layout, self.q, self.args, self._rows)
+        self.system = make_system(self._layout, redundant, names)
         if self.system.force is not None:  # checks the users' functions
             t = jnp.zeros((), self.q.dtype)
             jax.eval_shape(self.system.force, self.q, self.v, t, self.args)
@@ -222,6 +225,40 @@ class Scene:
     ) -> Float[Array, "... rows"]:
         """The multipliers of a joint, constraint or drive, one column for each row."""
         return sol.multipliers[..., self._rows[joint]]
+
+    def columns(
+        self, sol: Solution, args: Parameters | None = None
+    ) -> dict[str, np.ndarray]:
+        """The motion along a run by name, for `sol.to_csv` and `sol.to_pandas`.
+
+        Every column has shape `(times,)`. There are
+
+        - of each body `crank.x`, `crank.y`, `crank.vx`, `crank.vy` of its mass centre; in
+          the plane `crank.angle` and `crank.angle_rate`; in space the unit quaternion
+          `crank.qw` to `crank.qz` and the angular velocity `crank.omega_x` in space;
+        - of each part that `measure` knows `spring.length`, `spring.length_rate` and
+          `spring.force`, or `hinge.angle`, `hinge.angle_rate` and `hinge.torque`; of parts
+          that act on a point `load.x`, `load.vx` and `load.force_x`;
+        - of each joint and drive `hinge.reaction_x` and `hinge.reaction_torque`; see
+          `reaction`.
+
+        Pass the `args` of the run if they are not those of the scene.
+
+        **Raises:** `ValueError` for a batch of runs, and for a run that has saved the values
+        of a function in place of its states.
+        """
+        if not isinstance(sol.ys, State) or sol.ys.q.ndim != 2:
+            raise ValueError(
+                "`scene.columns` needs the states of one run: neither a batch, nor the "
+                "values of `SaveAt(fn=...)`."
+            )
+        args = self.args if args is None else args
+        found = of_bodies(self._layout, sol.ys.q, sol.ys.v, args)
+        for name in measures_of(self._layout):
+            found |= of_readout(self._layout, name, self.measure(sol, name, args))
+        for name in (name for name in self._rows if name in self._ends):
+            found |= of_reaction(name, self.reaction(sol, name, args))
+        return found
 
     def __str__(self) -> str:
         parts = self._kinds, self._ends, self._rows

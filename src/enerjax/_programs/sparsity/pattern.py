@@ -16,8 +16,8 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array
-from scipy.sparse import csr_array, vstack
 
 from ..primitives import (
     CONTRACTION,
@@ -43,7 +43,7 @@ _MAX_ENTRIES = 20_000_000
 class _Depends:
     """An array that depends on unknowns, with a row of unknowns for each entry."""
 
-    def __init__(self, rows: csr_array, aval: Any):
+    def __init__(self, rows: "scipy.sparse.csr_array", aval: Any):
         self.rows = rows
         self.shape, self.dtype = aval.shape, aval.dtype
 
@@ -65,7 +65,7 @@ class _TooDense(Exception):
 
 def jacobian_pattern(
     fn: Callable[[Array], Array], like: Array, *, of_values: bool = False
-) -> csr_array | None:
+) -> "scipy.sparse.csr_array | None":
     """The entries of the Jacobian `d fn / dx` that can differ from zero.
 
     The pattern has the shape `(fn(like).size, like.size)`. It is `None` if so many entries
@@ -85,12 +85,14 @@ def jacobian_pattern(
         return None
     if isinstance(out, _Depends):
         return out.rows
-    return csr_array((int(np.prod(jnp.shape(out))), size), dtype=bool)
+    return scipy.sparse.csr_array((int(np.prod(jnp.shape(out))), size), dtype=bool)
 
 
-def _identity(size: int) -> csr_array:
+def _identity(size: int) -> "scipy.sparse.csr_array":
     index = np.arange(size + 1)
-    return csr_array((np.ones(size, bool), index[:-1], index), shape=(size, size))
+    return scipy.sparse.csr_array(
+        (np.ones(size, bool), index[:-1], index), shape=(size, size)
+    )
 
 
 def _equation(equation: Any, values: list[_Value], of_values: bool) -> list[_Value]:
@@ -120,27 +122,29 @@ def _entries(value: _Value) -> int:
     return int(np.prod(np.shape(value), dtype=int))
 
 
-def _rows(value: _Value, width: int) -> csr_array:
+def _rows(value: _Value, width: int) -> "scipy.sparse.csr_array":
     if isinstance(value, _Depends):
         return value.rows
-    return csr_array((_entries(value), width), dtype=bool)
+    return scipy.sparse.csr_array((_entries(value), width), dtype=bool)
 
 
 def _width(values: list[_Value]) -> int:
     return next(shape_of(v.rows)[1] for v in values if isinstance(v, _Depends))
 
 
-def shape_of(rows: csr_array) -> tuple[int, int]:
+def shape_of(rows: "scipy.sparse.csr_array") -> tuple[int, int]:
     num_rows, width = rows.shape  # pyright: ignore
     return num_rows, width
 
 
-def _where(rows: csr_array, keep: np.ndarray) -> csr_array:
+def _where(rows: "scipy.sparse.csr_array", keep: np.ndarray) -> "scipy.sparse.csr_array":
     """The rows to keep; the others become empty."""
     counts = np.diff(rows.indptr)
     kept = np.repeat(keep, counts)
     pointers = np.concatenate([[0], np.cumsum(np.where(keep, counts, 0))])
-    return csr_array((rows.data[kept], rows.indices[kept], pointers), shape=rows.shape)
+    return scipy.sparse.csr_array(
+        (rows.data[kept], rows.indices[kept], pointers), shape=rows.shape
+    )
 
 
 def _elementwise(primitive: Any, values: list[_Value], params: Any, avals: Any) -> list:
@@ -180,8 +184,8 @@ def _moved(primitive: Any, values: list[_Value], params: Any, avals: Any) -> lis
             rows.append(value.rows)
             first += _entries(value)
         operands[k] = numbers
-    blank = csr_array((1, _width(values)), dtype=bool)
-    table = csr_array(vstack([blank, *rows]))
+    blank = scipy.sparse.csr_array((1, _width(values)), dtype=bool)
+    table = scipy.sparse.csr_array(scipy.sparse.vstack([blank, *rows]))
     move = MOVES.get(primitive.name)
     outs = move(*operands, **params) if move else evaluate(primitive, operands, params)
     return [table[np.nan_to_num(np.asarray(out)).astype(int).ravel()] for out in outs]
@@ -197,12 +201,14 @@ def _summed(primitive: Any, values: list[_Value], params: Any, avals: Any) -> li
     return [_gathered(value.rows, target, numbers.size)]
 
 
-def _gathered(rows: csr_array, target: np.ndarray, count: int) -> csr_array:
+def _gathered(
+    rows: "scipy.sparse.csr_array", target: np.ndarray, count: int
+) -> "scipy.sparse.csr_array":
     """The unions of the rows with the same target. Negative targets are left out."""
     source = np.nonzero(target >= 0)[0]
     ones = np.ones(source.size, bool)
     shape = (count, target.size)
-    return csr_array((ones, (target[source], source)), shape=shape) @ rows
+    return scipy.sparse.csr_array((ones, (target[source], source)), shape=shape) @ rows
 
 
 def _added(primitive: Any, values: list[_Value], params: Any, avals: Any) -> list:
@@ -271,7 +277,9 @@ def _everything(primitive: Any, values: list[_Value], params: Any, avals: Any) -
             raise _TooDense
         pointers = union.size * np.arange(count + 1)
         ones = np.ones(count * union.size, bool)
-        outs.append(csr_array((ones, np.tile(union, count), pointers), (count, width)))
+        outs.append(
+            scipy.sparse.csr_array((ones, np.tile(union, count), pointers), (count, width))
+        )
     return outs
 
 

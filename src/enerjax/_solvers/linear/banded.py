@@ -15,9 +15,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float, Int
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from ..._programs import batched_columns, columns_along, in_one_function, shape_of
 from .dense import AbstractFactors
@@ -39,11 +38,11 @@ class Band:
     - `padding`: ones on the diagonal at padded positions, shape as `places`.
     """
 
-    def __init__(self, pattern: csr_array, rarely: bool = False):
+    def __init__(self, pattern: "scipy.sparse.csr_array", rarely: bool = False):
         self._rarely = rarely
         size, _ = shape_of(pattern)
         both = (pattern + pattern.T).tocsr()
-        order = reverse_cuthill_mckee(both, symmetric_mode=True)
+        order = scipy.sparse.csgraph.reverse_cuthill_mckee(both, symmetric_mode=True)
         sizes = block_sizes(both[order][:, order])
         self.width = width = int(sizes.max(initial=1))
         self.num_blocks = blocks = sizes.size
@@ -96,7 +95,7 @@ class Band:
         return entries[self.places] + jnp.asarray(self.padding, x.dtype)
 
 
-def block_sizes(pattern: csr_array) -> np.ndarray:
+def block_sizes(pattern: "scipy.sparse.csr_array") -> np.ndarray:
     """The sizes of blocks that make a symmetric banded matrix block tridiagonal.
 
     The size of the first block determines the smallest possible sizes of all others.
@@ -140,7 +139,7 @@ def coloured_products(
     return columns(fn, x, colours[:, None] == numbers)
 
 
-def column_colours(pattern: csr_array, order: np.ndarray) -> np.ndarray:
+def column_colours(pattern: "scipy.sparse.csr_array", order: np.ndarray) -> np.ndarray:
     """Colours of the columns, such that columns of equal colour share no row.
 
     Greedy: in the given `order`, each column gets the first colour that is still free.

@@ -7,9 +7,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 from ..._programs import Indices, is_known, jacobian_pattern, summed
 
@@ -130,7 +129,9 @@ def hessian(
     gradient = jax.grad(fn)
     pattern = jacobian_pattern(gradient, at) if at.size > _FEW else None
     if pattern is not None and together is not None:
-        pattern = csr_array(pattern.toarray() | (together[:, None] == together[None]))
+        pattern = scipy.sparse.csr_array(
+            pattern.toarray() | (together[:, None] == together[None])
+        )
     places = None if pattern is None else _places(pattern)
     if places is None:
         return jax.jacfwd(gradient)(at)
@@ -147,7 +148,7 @@ def in_blocks(matrix: Float[Array, "n n"]) -> Symmetric:
     """The matrix in block-diagonal form, if it is large, known and has that form."""
     if matrix.shape[0] <= _FEW or not is_known(matrix):
         return matrix
-    places = _places(csr_array(np.asarray(matrix) != 0))
+    places = _places(scipy.sparse.csr_array(np.asarray(matrix) != 0))
     if places is None:
         return matrix
     padded = jnp.pad(matrix, ((0, 1), (0, 1))).at[-1, -1].set(0)
@@ -155,6 +156,6 @@ def in_blocks(matrix: Float[Array, "n n"]) -> Symmetric:
     return BlockDiagonal(places, blocks + jnp.asarray(places.padding, matrix.dtype))
 
 
-def _places(pattern: csr_array) -> Places | None:
-    _, labels = connected_components(pattern, directed=False)
+def _places(pattern: "scipy.sparse.csr_array") -> Places | None:
+    _, labels = scipy.sparse.csgraph.connected_components(pattern, directed=False)
     return Places(labels) if np.bincount(labels).max() <= _LARGEST_BLOCK else None

@@ -10,11 +10,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jax.extend.core import jaxpr_as_fun
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 from ..._programs import Indices, is_known, jacobian_pattern
 from .dense import inverse
@@ -52,8 +51,8 @@ def independent_blocks(constants: Float[np.ndarray, "n n"]) -> IndependentBlocks
     size = len(constants)
     rows, columns = np.nonzero(constants)
     entries = np.ones(rows.size), (rows, size + columns)
-    graph = csr_array(entries, shape=(2 * size, 2 * size))
-    count, labels = connected_components(graph, directed=False)
+    graph = scipy.sparse.csr_array(entries, shape=(2 * size, 2 * size))
+    count, labels = scipy.sparse.csgraph.connected_components(graph, directed=False)
     labels = labels.reshape(2, size)
     sizes, widths = (np.bincount(x, minlength=count) for x in labels)
     # A matrix with a block that is not square is singular. The solve will report that.

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
+import scipy
 from jaxtyping import Array, Float, PyTree
-from scipy.sparse import csr_array
 
 from ..._programs import (
     batched_columns,
@@ -34,7 +34,7 @@ class Dense:
     def __init__(
         self,
         solver: lx.AbstractLinearSolver | None,
-        pattern: csr_array | None = None,
+        pattern: "scipy.sparse.csr_array | None" = None,
         rarely: bool = False,
     ):
         self.solver, self._rarely = solver, rarely

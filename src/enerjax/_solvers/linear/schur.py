@@ -16,9 +16,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from ..._programs import Indices, jacobian_pattern, shape_of, summed, unmerged
 from .banded import block_sizes, coloured_products, column_colours
@@ -52,7 +51,7 @@ class SchurTables(Indices):
     - `padding`: ones on the diagonal where a block is smaller than the largest one.
     """
 
-    def __init__(self, pattern: csr_array, weight: Symmetric):
+    def __init__(self, pattern: "scipy.sparse.csr_array", weight: Symmetric):
         self.num_rows, size = shape_of(pattern)
         is_blocks = isinstance(weight, BlockDiagonal)
         blocks = weight.places.rows if is_blocks else np.arange(size)[None]
@@ -62,7 +61,9 @@ class SchurTables(Indices):
         label = np.zeros(size + 1, int)
         label[blocks.ravel()] = np.repeat(np.arange(len(blocks)), blocks.shape[1])
         shape = self.num_rows, len(blocks)
-        incidence = csr_array((np.ones(rows.size), (rows, label[columns])), shape=shape)
+        incidence = scipy.sparse.csr_array(
+            (np.ones(rows.size), (rows, label[columns])), shape=shape
+        )
         counts = np.diff(incidence.indptr)
         within = np.arange(incidence.nnz) - np.repeat(incidence.indptr[:-1], counts)
         self.touched = np.full((self.num_rows, max(counts.max(initial=0), 1)), len(blocks))
@@ -96,10 +97,10 @@ class SchurTables(Indices):
         self.transposed = np.full((size, counts.max(initial=1)), known.size)
         self.transposed[columns[order], within] = places[order]
 
-    def _cut(self, incidence: csr_array) -> None:
-        coupling = csr_array(incidence @ incidence.T)
-        order = reverse_cuthill_mckee(coupling, symmetric_mode=True)
-        sizes = block_sizes(csr_array(coupling[order][:, order]))
+    def _cut(self, incidence: "scipy.sparse.csr_array") -> None:
+        coupling = scipy.sparse.csr_array(incidence @ incidence.T)
+        order = scipy.sparse.csgraph.reverse_cuthill_mckee(coupling, symmetric_mode=True)
+        sizes = block_sizes(scipy.sparse.csr_array(coupling[order][:, order]))
         self.width, self.num_blocks = int(sizes.max(initial=1)), sizes.size
         number = np.repeat(np.arange(sizes.size), sizes)
         within = np.arange(self.num_rows) - (np.cumsum(sizes) - sizes)[number]
@@ -208,8 +209,8 @@ def schur_tables(
     if num_rows == 0:
         return None
     if pattern is None:
-        pattern = csr_array(np.ones((num_rows, like.size), bool))
-    tables = SchurTables(csr_array(pattern), weight)
+        pattern = scipy.sparse.csr_array(np.ones((num_rows, like.size), bool))
+    tables = SchurTables(scipy.sparse.csr_array(pattern), weight)
     return tables if tables.width <= _WIDEST else None
 
 

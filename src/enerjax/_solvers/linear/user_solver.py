@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
+import scipy
 from jaxtyping import Array, Float, PyTree
-from scipy.sparse import csr_array
 
 from ..._programs import shape_of
 from .banded import coloured_products, column_colours
@@ -127,14 +127,19 @@ class Sparse:
     It is constructed at trace time. Without a `pattern` all entries are stored.
     """
 
-    def __init__(self, solver: AbstractSparseSolver, pattern: csr_array | None, size: int):
-        if pattern is None:
-            pattern = csr_array(np.ones((size, size), bool))
-        rows, columns = pattern.nonzero()
+    def __init__(
+        self,
+        solver: AbstractSparseSolver,
+        pattern: "scipy.sparse.csr_array | None",
+        size: int,
+    ):
+        full = np.ones((size, size), bool)
+        known: Any = scipy.sparse.csr_array(full) if pattern is None else pattern
+        rows, columns = known.nonzero()
         order = np.lexsort((columns, rows))
         self.solver = solver
         self.pattern = SparsePattern(size, rows[order], columns[order])
-        self._colours = column_colours(pattern, np.arange(shape_of(pattern)[1]))
+        self._colours = column_colours(known, np.arange(shape_of(known)[1]))
 
     def evaluate(
         self, fn: Callable[[Array], Array], x: Float[Array, " n"]

@@ -12,6 +12,7 @@ from ..._types import Args
 from ..base import AbstractSystem, SIGNATURES, State
 from ..canonical import HamiltonianSystem, LagrangianSystem
 from ..kinematics import ConfigurationKinematics
+from ..names import Names
 from ..separable import System
 
 
@@ -105,6 +106,22 @@ def check_shapes(system: AbstractSystem, state: State, args: Args) -> None:
             f"`q` has {state.q.size} entries and `v`, the {name}, has {state.v.size}: "
             "give as many of each."
         )
+    _check_names(system.names, state, rows + state.q.size - state.v.size)
+
+
+def _check_names(names: Any, state: State, num_constraints: int) -> None:
+    if names is None:
+        return
+    if not isinstance(names, Names):
+        raise TypeError(f"`names` must be `enerjax.Names(coordinates=...)`, got {names!r}.")
+    sizes = dict(coordinates=state.q.size, velocities=state.v.size)
+    for role, size in (sizes | dict(constraints=num_constraints)).items():
+        given = getattr(names, role)
+        if given is not None and len(given) != size:
+            raise ValueError(
+                f"`Names(...)` has {len(given)} {role}, and the system has {size}: give a "
+                "name for each."
+            )
 
 
 def _internal_rows(system: AbstractSystem, state: State) -> int:

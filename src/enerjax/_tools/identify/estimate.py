@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-import scipy.stats
+import scipy
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
@@ -114,7 +114,7 @@ def covariance(
 
 def student(degrees_of_freedom: int) -> float:
     """Half the width of the confidence interval, in standard errors."""
-    return float(scipy.stats.t.ppf(0.5 + CONFIDENCE / 2, degrees_of_freedom))
+    return float(scipy.special.stdtrit(degrees_of_freedom, 0.5 + CONFIDENCE / 2))
 
 
 def names_of(parameters: PyTree[Any]) -> tuple[str, ...]:

@@ -1,16 +1,13 @@
 """Results on disk, chunk by chunk, from which an interrupted sweep can be resumed."""
 
-import io
 import json
 import os
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, BinaryIO
 
 import numpy as np
 
-from .fingerprint import checksum
+from ..._files import read_arrays, write_arrays, write_whole
 
 
 # A draft that has not been written to for so many seconds belongs to a killed process.
@@ -32,7 +29,7 @@ class Store:
         label = self.path / "sweep.json"
         if not label.exists():
             text = json.dumps(fingerprint, indent=1)
-            self._put(label, lambda file: file.write(text.encode()))
+            write_whole(label, lambda file: file.write(text.encode()))
         try:
             found = dict(json.loads(label.read_text()))
         except (ValueError, TypeError):
@@ -57,41 +54,21 @@ class Store:
         file = self._file(chunk)
         if not file.exists():
             return None
-        data = file.read_bytes()
-        try:
-            with np.load(io.BytesIO(data)) as content:
-                arrays = [content[f"arr_{k}"] for k in range(len(content.files) - 1)]
-                is_whole = str(content["sha256"]) == checksum(arrays)
-        # A damaged archive raises errors of a dozen types.
-        except Exception:
-            is_whole, arrays = False, []
-        if not is_whole:
+        arrays = read_arrays(file)
+        if arrays is None:
             raise ValueError(
                 f"`path`: {file} is damaged: its content is not what was written. Delete "
                 "the file and call `sweep` again, which repeats this chunk and keeps the "
                 "others; if it happens again, check the disk."
             )
-        return arrays
+        return list(arrays.values())
 
     def write(self, chunk: int, arrays: list[np.ndarray]) -> None:
-        word = np.array(checksum(arrays))
-        self._put(self._file(chunk), lambda file: np.savez(file, *arrays, sha256=word))
+        names = (f"arr_{k}" for k in range(len(arrays)))
+        write_arrays(self._file(chunk), dict(zip(names, arrays, strict=True)))
 
     def _file(self, chunk: int) -> Path:
         return self.path / f"chunk-{chunk:06d}.npz"
-
-    def _put(self, target: Path, write: Callable[[BinaryIO], Any]) -> None:
-        # The draft is in the same folder, because `replace` is atomic only within one file
-        # system. Its name contains the process, because others may write the same file.
-        draft = target.with_name(f".{target.name}.{os.getpid()}")
-        try:
-            with draft.open("wb") as file:
-                write(file)
-                file.flush()
-                os.fsync(file.fileno())
-            draft.replace(target)
-        finally:
-            draft.unlink(missing_ok=True)
 
     def _clear(self) -> None:
         """Removes the drafts of processes that were killed while they wrote."""

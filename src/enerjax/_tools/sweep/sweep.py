@@ -1,21 +1,17 @@
 import os
-import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
 import numpy as np
-from typing_extensions import TypeAliasType
 
+from ..._progress import check_progress, Line, Progress
 from ..._run import positive_integer
 from .fingerprint import fingerprint
 from .grid import make_grid
 from .labelled import Sweep
 from .program import Chunk, make_lane
 from .store import Store
-
-
-Progress = TypeAliasType("Progress", bool | Callable[[int, int], None])
 
 
 def sweep(
@@ -75,6 +71,7 @@ def sweep(
     **Raises:** `ValueError` or `TypeError` for bad input, for a `fn` that returns anything
     but arrays, and if `path` holds another sweep or a damaged file.
     """
+    check_progress(progress)
     grid = make_grid(over)
     chunk = positive_integer("chunk", chunk)
     if batch_size is not None:
@@ -141,9 +138,5 @@ def _reporter(progress: Progress, total: int) -> Callable[[int], None]:
     if not progress:
         return lambda done: None
 
-    def line(done: int) -> None:
-        end = "\n" if done == total or not sys.stderr.isatty() else ""
-        start = "\r" if sys.stderr.isatty() else ""
-        print(f"{start}{done} of {total} lanes", end=end, file=sys.stderr, flush=True)
-
-    return line
+    line = Line()
+    return lambda done: line.show(f"{done} of {total} lanes", is_last=done == total)

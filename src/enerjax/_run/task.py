@@ -1,0 +1,101 @@
+"""A run with its checked arguments: what its programs have in common."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import PyTree
+
+from .._operators import AbstractModel
+from .._solvers import RootFinder
+from .._system import AbstractSystem, State
+from .._types import Args, Scalar
+from ..schemes import AbstractScheme
+from .audit import audit, Measures, measures
+from .loop import Progress, Stepper
+from .saving import AbstractSaving, Rows, SaveFunction
+from .solution import Solution, Statistics
+from .step import model_for
+from .step_sizes import AbstractPlan
+
+
+class Task(eqx.Module):
+    """The checked arguments of `simulate`."""
+
+    system: AbstractSystem
+    scheme: AbstractScheme
+    start: State
+    args: Args
+    plan: AbstractPlan
+    saving: AbstractSaving
+    fn: SaveFunction | None
+    root_finder: RootFinder
+    max_halvings: int | None
+
+    def stepper(self) -> Stepper:
+        return Stepper(
+            scheme=self.scheme,
+            model=model_for(self.scheme, self.system, self.start, self.args),
+            plan=self.plan,
+            root_finder=self.root_finder,
+            max_halvings=self.max_halvings,
+        )
+
+    @property
+    def observes_in_loop(self) -> bool:
+        """Whether the loop keeps values of `fn`.
+
+        Then states need not be stored. Otherwise they are observed together after the loop,
+        which is faster.
+        """
+        return self.fn is not None and self.saving.keeps_rows
+
+    def keep(self, model: AbstractModel) -> Callable[[State, Scalar], PyTree[Any]]:
+        """What the loop keeps of the state at a place."""
+
+        def keep(state: State, place: Scalar) -> PyTree[Any]:
+            kept = model.to_rates(state)
+            if not self.observes_in_loop:
+                return kept
+            return self._observe(model, kept, self.plan.time(place))
+
+        return keep
+
+    def _observe(
+        self, model: AbstractModel, state: State, t: Scalar
+    ) -> tuple[PyTree[Any], Measures]:
+        """The user's form of a state, or the value of `fn`, and its part of the audit.
+
+        The state is one of `model.in_rates`.
+        """
+        value: PyTree[Any] = model.in_rates.to_user(state)
+        if self.fn is not None:
+            value = jax.tree.map(jnp.asarray, self.fn(t, value, self.args))
+        timed = State(state.q, state.v, t if self.system.is_timed else None)
+        return value, measures(model.in_rates, timed)
+
+    def solution(self, model: AbstractModel, rows: Rows, end: Progress) -> Solution:
+        """The solution with these rows, of a run that has ended."""
+        observe = lambda state, t: self._observe(model, state, t)
+        in_loop = self.observes_in_loop
+        ys, measured = rows.kept if in_loop else jax.vmap(observe)(rows.kept, rows.ts)
+        return Solution(
+            ts=rows.ts,
+            ys=ys,
+            multipliers=jax.vmap(model.user_multipliers)(rows.multipliers),
+            details=rows.details,
+            audit=audit(measured, rows.energies),
+            stats=Statistics(
+                newton_iterations=rows.costs.iterations,
+                residual=rows.costs.residual,
+                halvings=rows.costs.halvings,
+                local_error=rows.costs.local_error,
+                completed_steps=end.completed,
+                rejected_steps=self.plan.num_rejected(end.memory),
+            ),
+            end=model.to_user(end.state),
+            result=end.result,
+            names=self.system.names,
+        )
