@@ -59,8 +59,8 @@ def run(
     other programs in this process (twice if these measure the time of a step). Both get a
     flag for a quick run. `modes` are the settings of XLA. The rows are printed, drawn, and
     saved under the name of the script; a picture that the documentation shows is replaced
-    there. With `works` both also get the names of the works to
-    measure; each row has its name as `work`, and replaces saved rows of the same work.
+    there. With `works` both also get the names of the works to measure; each row has its
+    name as `work`, and replaces saved rows of the same work.
     """
     chosen = _options(sys.modules["__main__"].__doc__ or "", works)
     asked = (
