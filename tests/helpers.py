@@ -6,6 +6,7 @@ and `march` has one program for all numbers of steps.
 
 import ast
 import functools
+import inspect
 import pathlib
 import re
 from concurrent.futures import ThreadPoolExecutor
@@ -35,6 +36,19 @@ def code_blocks(page):
 def code_of(page):
     """The Python code of a page of the documentation, block by block."""
     return [code for _, code in code_blocks(HERE.parent / "docs" / page)]
+
+
+def public_names():
+    """All public names with their values. A value can have several names."""
+    found = {}
+    for owner in (ej, ej.schemes, ej.scenes, ej.problems):
+        for name, value in vars(owner).items():
+            if not name.startswith("_") and not inspect.ismodule(value):
+                found[f"{owner.__name__}.{name}"] = value
+    for owner in (ej.bodies, ej.joints, ej.forces, ej.drives):
+        # The modules of parts list only these.
+        found |= {f"{owner.__name__}.{name}": getattr(owner, name) for name in dir(owner)}
+    return found
 
 
 def imported(name):

@@ -11,6 +11,8 @@ import pytest
 
 import enerjax as ej
 
+from .helpers import public_names
+
 
 PACKAGE = pathlib.Path(ej.__file__).parent
 SOURCES = sorted(PACKAGE.rglob("*.py"))
@@ -32,6 +34,12 @@ LAYERS = [
     {"__main__"},
 ]
 LAYER = {name: number for number, names in enumerate(LAYERS) for name in names}
+# Types that annotations use have no docstring.
+PUBLIC = {
+    name: value
+    for name, value in public_names().items()
+    if inspect.isclass(value) or inspect.isfunction(value)
+}
 
 
 def part(path):
@@ -249,21 +257,6 @@ def test_classes_are_abstract_or_final(cls):
                 inherited, "__isabstractmethod__", False
             )
             assert not overridden, f"{name} of {base.__name__} is overridden"
-
-
-def public():
-    for owner in (ej, ej.problems):
-        for name, value in vars(owner).items():
-            if not name.startswith("_") and not inspect.ismodule(value):
-                yield f"{owner.__name__}.{name}", value
-    for owner in (ej.bodies, ej.joints, ej.forces, ej.drives):
-        for name, value in vars(owner).items():
-            here = getattr(value, "__module__", None) == owner.__name__
-            if not name.startswith("_") and here:
-                yield f"{owner.__name__}.{name}", value
-
-
-PUBLIC = dict(public())
 
 
 @pytest.mark.parametrize("name", PUBLIC)

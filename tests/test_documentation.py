@@ -1,17 +1,23 @@
-"""The code in the documentation runs, and its tables of the package are complete."""
+"""The code in the documentation runs, links lead somewhere, and lists are complete."""
 
+import operator
 import pathlib
+import re
+import runpy
 
 import matplotlib.pyplot as plt
 import pytest
 
 import enerjax as ej
 
-from .helpers import code_blocks, long
+from .helpers import code_blocks, long, public_names
 
 
 HOME = pathlib.Path(__file__).parents[1]
-PAGES = [HOME / "README.md", *sorted((HOME / "docs").glob("*.md"))]
+DOCS = HOME / "docs"
+API = sorted((DOCS / "api").glob("*.md"))
+PAGES = [HOME / "README.md", *sorted(DOCS.glob("*.md")), *API]
+NAVIGATION = re.findall(r"([\w/-]+\.md)$", (HOME / "mkdocs.yml").read_text(), re.MULTILINE)
 
 
 # Blocks that are marked with `no-run` need an optional extra, or compile for most of a
@@ -46,14 +52,47 @@ def test_code_that_is_not_run_is_valid(page):
             compile(code, str(page), "exec")
 
 
-def test_the_readme_links_to_every_page():
-    text = PAGES[0].read_text()
-    assert [page.name for page in PAGES[1:] if f"(docs/{page.name})" not in text] == []
+def test_the_navigation_has_every_page_once():
+    """A page that `nav` in `mkdocs.yml` lacks could not be found by readers."""
+    pages = [str(page.relative_to(DOCS)) for page in PAGES[1:]]
+    pages += [f"notebooks/{path.stem}.md" for path in (HOME / "notebooks").glob("*.ipynb")]
+    assert len(pages) > 20
+    assert sorted(NAVIGATION) == sorted(pages)
+
+
+@pytest.mark.parametrize(
+    "page", [*PAGES, HOME / "CONTRIBUTING.md", HOME / "CHANGELOG.md"], ids=lambda x: x.name
+)
+def test_links_and_pictures_are_files(page):
+    """The build of the site checks the anchors of links, and not the pictures."""
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text()):
+        made = re.fullmatch(r"(?:\.\./)?(notebooks/\w+)\.md", target)
+        file = HOME / f"{made[1]}.ipynb" if made else page.parent / target
+        assert file.exists(), target
+        shown = DOCS if page.is_relative_to(DOCS) else HOME
+        assert file.resolve().is_relative_to(HOME if made else shown), "not in the site"
+
+
+def test_the_api_pages_list_every_public_name():
+    """A new public name needs a line `::: NAME` on the page in `docs/api` that it suits."""
+    text = "\n".join(page.read_text() for page in API)
+    names = re.findall(r"^(?:::: |\| `)(enerjax\.[\w.]+)", text, re.MULTILINE)
+    listed = [operator.attrgetter(name.partition(".")[2])(ej) for name in names]
+    assert len({id(value) for value in listed}) == len(listed)
+    shown = {id(value) for value in listed}
+    assert [name for name, value in public_names().items() if id(value) not in shown] == []
 
 
 def test_the_table_of_subpackages_is_complete():
-    text = (HOME / "docs" / "how-it-works.md").read_text()
+    text = (DOCS / "how-it-works.md").read_text()
     package = pathlib.Path(ej.__file__).parent
     names = [path.parent.name for path in package.glob("*/__init__.py")]
     assert len(names) > 5
     assert [name for name in names if f"| `{name}` |" not in text] == []
+
+
+@pytest.mark.slow
+def test_the_moving_picture_can_be_drawn(tmp_path):
+    script = runpy.run_path(str(DOCS / "moving_picture.py"))
+    script["draw"](tmp_path / "picture.gif", frames=2)
+    assert (tmp_path / "picture.gif").read_bytes().startswith(b"GIF89a")

@@ -1,6 +1,7 @@
 """The error that a failed run raises."""
 
 import contextlib
+import re
 from collections.abc import Iterator
 
 import equinox as eqx
@@ -71,7 +72,7 @@ def explained_memory_error(num_steps: int) -> Iterator[None]:
     try:
         yield
     except jax.errors.JaxRuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):
+        if not re.search("RESOURCE_EXHAUSTED|Out of memory", str(error)):
             raise
         raise MemoryError(
             f"This run of {num_steps} steps does not fit into memory. Save fewer rows with "

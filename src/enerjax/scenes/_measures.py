@@ -97,8 +97,10 @@ class PlanarTurn(AbstractMeasure):
 
 @dataclass(frozen=True)
 class Turn(AbstractMeasure):
-    """The angle about a common axis in space, which jumps at half a turn; its rate does
-    not."""
+    """The angle about a common axis in space.
+
+    It jumps at half a turn; its rate does not.
+    """
 
     is_angle = True
     reads = ("axes",)
