@@ -244,7 +244,7 @@ class Scene:
 
         Pass the `args` of the run if they are not those of the scene.
 
-        **Raises:** `ValueError` for a batch of runs, and for a run that has saved the values
+        **Raises:** `ValueError` for a batch of runs, and for one that has saved the values
         of a function in place of its states.
         """
         if not isinstance(sol.ys, State) or sol.ys.q.ndim != 2:
