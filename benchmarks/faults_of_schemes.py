@@ -27,7 +27,7 @@ FAULTS = (
     ),
     Fault(
         "chain rule: a straight line across the origin",
-        "_discrete/choices.py",
+        "_discrete/piecewise.py",
         "    cut = jnp.where(across, b - a, cut)\n",
         "",
         "The angle of a point that passes straight through the origin has no change.",

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 import enerjax as ej
 from enerjax._operators import SeparableModel
 from enerjax._solvers import Chord, find_root, Newton, schur, schur_tables
-from enerjax._solvers.linear.blocks import in_blocks
+from enerjax._solvers.linear.block_diagonal import in_blocks
 
 from .helpers import EPS, SCHEMES
 

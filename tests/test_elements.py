@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import enerjax as ej
-from enerjax._solvers.linear.blocks import BlockDiagonal
+from enerjax._solvers.linear.block_diagonal import BlockDiagonal
 
 from .helpers import EPS
 

@@ -9,7 +9,7 @@ import pytest
 
 import enerjax as ej
 from enerjax._programs.sparsity.pattern import jacobian_pattern
-from enerjax._solvers.linear.blocks import BlockDiagonal
+from enerjax._solvers.linear.block_diagonal import BlockDiagonal
 
 from .helpers import solve
 

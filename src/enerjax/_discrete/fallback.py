@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 from .._programs import evaluate
 from .base import significant
-from .choices import share
+from .piecewise import share
 from .transform import at_a, at_b, Moving, Switching, Value
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .arithmetic import both
-from .choices import share
+from .piecewise import share
 from .transform import (
     at_a,
     at_b,

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 
 from .._programs import primitives
-from . import arithmetic, choices, elementary, linalg, loops
+from . import arithmetic, elementary, linalg, loops, piecewise
 from .arithmetic import linear, rewritten, unary
 from .transform import Rule
 
@@ -33,7 +33,7 @@ RULES: dict[str, Rule] = {
     **dict.fromkeys(primitives.COMPONENTS, linear()),
     **dict.fromkeys(["cumsum", "reduce_sum", "sharding_constraint"], linear()),
     "scatter-add": linear(0, 2),
-    **dict.fromkeys("add sub neg add_any".split(), choices.sum_entries),
+    **dict.fromkeys("add sub neg add_any".split(), piecewise.sum_entries),
     # The values differ, although their derivative is stopped.
     **dict.fromkeys(
         ["stop_gradient", "optimization_barrier"], lambda values, params: values
@@ -68,17 +68,17 @@ RULES: dict[str, Rule] = {
     "erf": unary(elementary.smooth(jax.scipy.special.erf, 0.4)),
     "erfc": unary(elementary.smooth(jax.scipy.special.erfc, 0.4)),
     "abs": arithmetic.absolute,
-    **dict.fromkeys(primitives.PIECEWISE_CONSTANT, choices.piecewise_constant),
-    "atan2": choices.atan2,
+    **dict.fromkeys(primitives.PIECEWISE_CONSTANT, piecewise.piecewise_constant),
+    "atan2": piecewise.atan2,
     "max": arithmetic.extreme(1),
     "min": arithmetic.extreme(-1),
     "reduce_max": arithmetic.reduce_extreme(jnp.maximum),
     "reduce_min": arithmetic.reduce_extreme(jnp.minimum),
-    **dict.fromkeys(primitives.LOGICAL_REDUCTIONS, choices.reduce_logic),
+    **dict.fromkeys(primitives.LOGICAL_REDUCTIONS, piecewise.reduce_logic),
     "clamp": rewritten(lambda low, x, high: jnp.minimum(jnp.maximum(x, low), high)),
-    **dict.fromkeys(primitives.COMPARISONS | primitives.LOGIC, choices.compare),
-    "convert_element_type": choices.convert,
-    "select_n": choices.select,
+    **dict.fromkeys(primitives.COMPARISONS | primitives.LOGIC, piecewise.compare),
+    "convert_element_type": piecewise.convert,
+    "select_n": piecewise.select,
     "reduce_prod": arithmetic.reduce_prod,
     "cholesky": linalg.cholesky,
     "triangular_solve": linalg.triangular_solve,

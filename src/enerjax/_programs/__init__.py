@@ -9,8 +9,9 @@ from .compiled import (
 from .counting import num_operations as num_operations
 from .digest import checksum as checksum, digest as digest
 from .fast_loops import enable_fast_loops as enable_fast_loops
+from .hashable_indices import Indices as Indices
 from .lanes import in_any_lane as in_any_lane
-from .one_function.calls import in_one_function as in_one_function, unmerged as unmerged
+from .one_function.api import in_one_function as in_one_function, unmerged as unmerged
 from .one_function.obstacles import why_not_one_function as why_not_one_function
 from .one_function.possible import LARGEST_SUM as LARGEST_SUM
 from .one_function.products import plain_products as plain_products, summed as summed
@@ -24,7 +25,6 @@ from .sparsity.pattern import (
     LARGE as LARGE,
     shape_of as shape_of,
 )
-from .static_indices import Indices as Indices
 from .tracing import (
     evaluate as evaluate,
     function_with_own_derivative as function_with_own_derivative,

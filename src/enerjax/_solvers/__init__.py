@@ -1,7 +1,7 @@
 """Newton's method, differentiable roots and linear algebra. Contains no mechanics."""
 
 from .linear.assembled import Assembled as Assembled, row_hessians as row_hessians
-from .linear.blocks import (
+from .linear.block_diagonal import (
     as_dense as as_dense,
     BlockDiagonal as BlockDiagonal,
     blocks_of as blocks_of,
@@ -47,7 +47,7 @@ from .linear.user_solver import (
 from .newton import Newton as Newton
 from .newton_iterations import max_norm as max_norm
 from .root import find_root as find_root, ROOT as ROOT
-from .root_search import (
+from .root_finding import (
     Chord as Chord,
     flattened as flattened,
     Root as Root,

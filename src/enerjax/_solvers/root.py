@@ -20,7 +20,7 @@ from .._types import Flag, Scalar
 from .linear.dense import AbstractFactors
 from .linear.jacobian import Linearisable, linearisable
 from .newton import Newton, Start
-from .root_search import Chord, flat_of, flattened, Root, RootFinder, search
+from .root_finding import Chord, flat_of, flattened, Root, RootFinder, search
 
 
 # The name by which policies of `jax.checkpoint` refer to the value of a root.

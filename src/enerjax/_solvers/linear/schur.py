@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from ..._programs import Indices, jacobian_pattern, shape_of, summed, unmerged
 from .banded import block_sizes, coloured_products, column_colours
-from .blocks import BlockDiagonal, Symmetric
+from .block_diagonal import BlockDiagonal, Symmetric
 from .dense import inverse
 
 

@@ -1,4 +1,4 @@
-"""Rules of choices: comparisons, logic, selections, and the branch cut of an angle."""
+"""Rules of piecewise functions: comparisons, logic, selections, an angle's branch cut."""
 
 from typing import Any
 
