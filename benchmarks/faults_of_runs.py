@@ -107,6 +107,14 @@ FAULTS = (
         of("rewriting::test_rewritten_programs_have_the_same_values_and_derivatives"),
     ),
     Fault(
+        "rewriting: places with many numbers",
+        "_programs/one_function/rewriting.py",
+        "        source[before[is_often], place] = order[is_often]\n",
+        "        source[0, place] = order[is_often]\n",
+        "Of many numbers that are added to one place only the last is.",
+        of("rewriting::test_rewritten_programs_have_the_same_values_and_derivatives"),
+    ),
+    Fault(
         "rewriting: places that are clipped",
         "_programs/one_function/rewriting.py",
         '    if params["mode"] == lax.GatherScatterMode.CLIP:\n'

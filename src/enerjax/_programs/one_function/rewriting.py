@@ -17,6 +17,7 @@ import numpy as np
 from jax import lax
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
+from jax.extend.core.primitives import reduce_sum_p
 from jaxtyping import Array, Int
 
 from ..primitives import CONTRACTION, SCATTERS
@@ -139,9 +140,9 @@ _LOOPS = {"scan": _scan, "while": _while, "cond": _cond}
 
 # Scatters to known places ----------------------------------------------------------------
 
-# The number of updates of one place up to which they are added by a gather each. More
-# gathers compile slowly: a run of 60 springs between two coordinates took 18 s to compile;
-# with a loop 60 and 200 springs take 3 s.
+# The number of updates of one place up to which they are added by a gather of all places
+# each. More gathers compile slowly: a run of 60 springs between two coordinates took 18 s
+# to compile.
 _UNROLLED = 8
 
 
@@ -159,13 +160,25 @@ def _scattered(name: str, values: list[Any], params: dict[str, Any]) -> Array:
     # The number of earlier updates of the same place: one pass over all places adds the
     # first update of each, the next pass the second.
     before = np.arange(to.size) - np.searchsorted(to, to)
-    source = np.full((1 + before.max(initial=-1), size), updates.size)
-    source[before, to] = order
     updates = jnp.append(updates, jnp.zeros((), updates.dtype))
+    # The few places with many updates, such as a body that all others are attached to, are
+    # added up by themselves: passes over all places would be many.
+    often = np.unique(to[before >= _UNROLLED])
+    is_often = np.isin(to, often)
+    if often.size > 0:
+        source = np.full((1 + before.max(), often.size), updates.size - 1)
+        place = np.searchsorted(often, to[is_often])
+        source[before[is_often], place] = order[is_often]
+        sums = _reduced(reduce_sum_p, updates[source], dict(axes=(0,)))
+        source = np.full(size, often.size)
+        source[often] = np.arange(often.size)
+        sums = jnp.append(sums, jnp.zeros((), sums.dtype))
+        operand = operand + _picked(sums, source, operand.shape)
+    before, to, order = (x[~is_often] for x in (before, to, order))
+    source = np.full((1 + before.max(initial=-1), size), updates.size - 1)
+    source[before, to] = order
     add = lambda x, row: x + _picked(updates, row, operand.shape)
-    if len(source) <= _UNROLLED:
-        return functools.reduce(add, source, operand)
-    return lax.scan(lambda x, row: (add(x, row), None), operand, jnp.asarray(source))[0]
+    return functools.reduce(add, source, operand)
 
 
 # Sums of many entries -------------------------------------------------------------------
