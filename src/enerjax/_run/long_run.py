@@ -52,14 +52,10 @@ class _LongRun:
         self._max_attempts = task.plan.max_attempts
         self._num_rows = num_rows
         task = self._task
+        _check_alone(at_top_level(task))
         begin, carry = begin_run(task)
-        if not (at_top_level(task) and is_known((begin, carry))):
-            raise ValueError(
-                "`progress`, `checkpoint` and `resume` are for single runs: between two "
-                "pieces the run is in Python, where `jit`, `vmap`, `grad` and `jvp` cannot "
-                "follow. Leave them out inside of these. (`ej.sweep` reports and resumes "
-                "many runs.)"
-            )
+        # A number in the closure of a function of the system can be traced too.
+        _check_alone(is_known((begin, carry)))
         begin, carry = jax.device_get((begin, carry))
         program = piece.program(task, carry, np.array(0))
         self._fingerprint = _fingerprint(task, digest(program))
@@ -143,6 +139,15 @@ class _LongRun:
         none = lambda solution: solution.continuation
         kept = eqx.tree_at(none, solution, continuation, is_leaf=lambda x: x is None)
         return kept, reached
+
+
+def _check_alone(is_alone: bool) -> None:
+    if not is_alone:
+        raise ValueError(
+            "`progress`, `checkpoint` and `resume` are for single runs: between two pieces "
+            "the run is in Python, where `jit`, `vmap`, `grad` and `jvp` cannot follow. "
+            "Leave them out inside of these. (`ej.sweep` reports and resumes many runs.)"
+        )
 
 
 def _completed(sofar: _Sofar) -> int:

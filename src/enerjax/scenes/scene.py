@@ -244,8 +244,8 @@ class Scene:
 
         Pass the `args` of the run if they are not those of the scene.
 
-        **Raises:** `ValueError` for a batch of runs, and for one that has saved the values
-        of a function in place of its states.
+        **Raises:** `ValueError` for a batch of runs, and for a run that has saved a
+        function in place of its states.
         """
         if not isinstance(sol.ys, State) or sol.ys.q.ndim != 2:
             raise ValueError(
