@@ -32,7 +32,9 @@ from seeded_fault import Fault
 FAULTS: tuple[Fault, ...] = (*OF_SCHEMES, *OF_RUNS, *OF_MODELS)
 PROJECT = Path(__file__).parent.parent
 # Of the project, what tests read.
-_NEEDED = ("src", "tests", "benchmarks", "docs", "notebooks", "README.md", "pyproject.toml")
+_FOLDERS = ("src", "tests", "benchmarks", "docs", "notebooks")
+_TEXTS = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "CITATION.cff", "LICENSE")
+_NEEDED = (*_FOLDERS, *_TEXTS, "mkdocs.yml", "pyproject.toml")
 # The test that faults can be seeded fails wherever one is.
 _OF_THE_LIST = "tests/test_conventions.py::test_every_seeded_fault_can_be_seeded"
 _PYTEST = ("-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--deselect", _OF_THE_LIST)
