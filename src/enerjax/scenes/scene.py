@@ -14,10 +14,12 @@ from .._system import State, System
 from .._types import Coordinates, Real, Vector
 from ._compile import compile_parts, join, sort_parts
 from ._constraint_rows import check_reacting, row_names, rows_of
+from ._default_shapes import all_shapes, given_shapes
 from ._feedback import Moving
 from ._functions import make_system
 from ._gaps import Gap, Measured
 from ._law_checks import check_laws
+from ._motion import Motion, motion_of, numbers_by_name, Parts, states_of
 from ._parameters import Parameters
 from ._pose_view import View
 from ._readouts import measured_along, Readout
@@ -28,6 +30,7 @@ from .bodies import AbstractBody
 from .drives import AbstractDrive
 from .forces import AbstractForce
 from .joints import AbstractJoint
+from .shapes import Shape
 
 
 class Scene:
@@ -54,6 +57,8 @@ class Scene:
     - `args`: numbers for your own functions, which find them by name in the `args` of the
       system.
     - `redundant`: whether joints may be redundant; see `System`.
+    - `ground`: shapes of what is fixed in space, for pictures, such as a floor: one of
+      `ej.shapes`, or a list of them.
 
     A scene is immutable. `system` is passed to `simulate`, `args` are its `Parameters`, and
     `q` and `v` are the start before joints are closed. Parts of a kind are evaluated
@@ -77,6 +82,7 @@ class Scene:
         args: dict[str, Any] | None = None,
         *,
         redundant: bool = False,
+        ground: Shape = (),
     ):
         found = sort_parts(parts)
         bodies: list[AbstractBody] = found[AbstractBody]
@@ -87,6 +93,7 @@ class Scene:
             for part in found[kind]
         }
         self._kinds = {part.name: type(part).__name__ for part in parts}
+        self._shapes = given_shapes(bodies, ground)
         self.system = make_system(self._layout, redundant)
         self.q, self.v = (join([getattr(b, x) for b in bodies]) for x in ("q", "v"))
         check_laws(self._layout, self.q, self.args)
@@ -216,6 +223,36 @@ class Scene:
         args, ends = self.args if args is None else args, self._ends[joint]
         of_state = lambda q, x: reaction(self._layout, q, x, joint, ends, args)
         return each(of_state, ys.q, self.multipliers(sol, joint))
+
+    def motion(
+        self,
+        sol: Solution | ConsistentStart | Equilibrium | State | None = None,
+        times: Vector | None = None,
+        args: Parameters | None = None,
+    ) -> Motion:
+        """The poses of all bodies with their shapes, and the places of joints and forces,
+        along a run: all that pictures show, as NumPy arrays.
+
+        **Arguments:**
+
+        - `sol`: a run, of which the rows that it reached count; or one state, by default
+          the poses of the bodies.
+        - `times`: shape `(times,)`, within the rows; by default those of the rows. Between
+          rows positions and rotations are interpolated by their values and rates, with an
+          error of fourth order in the distance of the rows, and a warning if it can be
+          seen.
+        - `args`: those of the run if they are not those of the scene.
+
+        **Raises:** `ValueError` or `TypeError` for states that are not of this scene, a
+        batch, states that are all NaN, times outside of the rows, and too few rows.
+        """
+        args = self.args if args is None else args
+        state = State(self.q, self.v) if sol is None else sol
+        rows = states_of(self._layout, state)
+        numbers = numbers_by_name(self._layout, args)
+        shapes = all_shapes(self._layout, numbers, self.q, self._shapes)
+        parts = Parts(self._kinds, self._ends, shapes)
+        return motion_of(self._layout, rows, times, numbers, parts)
 
     def multipliers(
         self, sol: Solution | ConsistentStart | Equilibrium, joint: str
