@@ -19,6 +19,7 @@ TESTS = sorted(pathlib.Path(__file__).parent.glob("*.py"))
 # The rooms of the package; each imports only from lower ones, which stand further up.
 LAYERS = [
     {"_types"},
+    {"_pictures"},
     {"_programs"},
     {"_results", "_discrete", "_solvers"},
     {"_system"},

@@ -10,11 +10,13 @@ from ._frames import GROUND, Numbers
 from ._laws import Alignment
 from ._layout import Layout
 from .bodies import AbstractBody
-from .shapes import AbstractShape, as_shapes, Box, Capsule, Mesh, Shape, SLENDER, Sphere
+from .shapes import AbstractShape, as_shapes, Box, Capsule, Mesh, Shape, Sphere
 
 
 Shapes: TypeAlias = tuple[AbstractShape, ...]
 
+# The radius of all rods over their median length, and at most over that of a rod.
+_SLENDER, _THICKEST = 0.03, 0.08
 # The radius of a point mass over the size of the scene.
 _BEAD = 0.03
 # The least side of a box over its longest: flat bodies must be seen.
@@ -62,7 +64,21 @@ def all_shapes(
             found[name] = _linkage(points.of(name))
         else:
             found[name] = _box_with_arms(own, points.of(name))
-    return found
+    return _with_radii(found)
+
+
+def _with_radii(shapes: dict[str, Shapes]) -> dict[str, Shapes]:
+    """The shapes, with one radius for all rods that have none."""
+    rods = [x for own in shapes.values() for x in own if isinstance(x, Capsule)]
+    lengths = [float(x.length) for x in rods if x.radius is None]
+    if not lengths:
+        return shapes
+    radius = _SLENDER * float(np.median(lengths))
+    fitted = lambda x: x.with_radius(min(radius, _THICKEST * float(x.length)))
+    return {
+        name: tuple(fitted(x) if isinstance(x, Capsule) else x for x in own)
+        for name, own in shapes.items()
+    }
 
 
 class _Points:
@@ -137,7 +153,7 @@ def _linkage(points: np.ndarray) -> Shapes:
 
 
 def _rod(start: np.ndarray, end: np.ndarray) -> Capsule:
-    return Capsule.between(start, end, SLENDER * np.linalg.norm(end - start))
+    return Capsule.between(start, end)
 
 
 def _box_with_arms(own: Numbers, points: np.ndarray) -> Shapes:

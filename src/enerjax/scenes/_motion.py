@@ -19,10 +19,15 @@ from ._laws import Alignment
 from ._layout import Layout, Link
 from ._parameters import Parameters
 from ._pose_view import lift, View
+from ._symbols import Symbol, symbol_of
 from .shapes import AbstractShape
 
 
 Array: TypeAlias = np.ndarray
+
+
+# A pin that is open by more than this part of the size of the scene is a mistake.
+_OPEN = 0.05
 
 
 class BodyMotion(NamedTuple):
@@ -49,6 +54,7 @@ class LinkMotion(NamedTuple):
       part without points (an angle) is where a joint connects its bodies.
     - `axes`: the axes of the part in space, each of shape `(times, d)` and length one: one
       of a hinge or slider, two of a universal joint, else none.
+    - `symbol`: what it looks like, also where its class is one of yours; see `Symbol`.
     """
 
     name: str
@@ -57,6 +63,7 @@ class LinkMotion(NamedTuple):
     start: Float[Array, "times d"]
     end: Float[Array, "times d"]
     axes: tuple[Float[Array, "times d"], ...]
+    symbol: Symbol
 
 
 class Motion(NamedTuple):
@@ -201,12 +208,31 @@ def motion_of(
     places = _Places(layout, frames, numbers)
     links = tuple(
         LinkMotion(
-            link.name, parts.kinds[link.name], parts.ends[link.name], *places(section, link)
+            link.name,
+            parts.kinds[link.name],
+            parts.ends[link.name],
+            *places(section, link),
+            symbol_of(link.law),
         )
         for section in ("joints", "forces", "drives")
         for link in getattr(layout, section)
     )
+    _check_closed(links, frames)
     return Motion(ts, bodies, links, rows.outcome)
+
+
+def _check_closed(links: tuple[LinkMotion, ...], frames: Frames) -> None:
+    """Raises an error for pins that are open: the state is not of this scene."""
+    centres = frames.position.reshape(-1, frames.position.shape[-1])
+    ends = [x for link in links for x in (link.start, link.end)]
+    size = np.ptp(np.concatenate([centres, *ends]), axis=0).max()
+    for link in links:
+        gap = np.abs(link.end - link.start).max()
+        if link.symbol in ("pin", "weld") and gap > _OPEN * size:
+            raise ValueError(
+                f"'{link.name}' is open by {gap:.3g} in these states: they are not of this "
+                "scene, or of one with other lengths. Pass the `args` of the run."
+            )
 
 
 def _checked(times: Any, rows: Rows) -> Array:

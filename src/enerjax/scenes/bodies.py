@@ -26,7 +26,7 @@ from ._body_coordinates import (
 from ._frames import Numbers
 from ._part import only_parts
 from ._rotations import mass_and_inertia, quaternion_of, rotation_matrix
-from .shapes import AbstractShape, as_shapes, Capsule, Shape, SLENDER
+from .shapes import AbstractShape, as_shapes, Capsule, Shape
 
 
 class AbstractBody(eqx.Module):
@@ -145,8 +145,7 @@ class PlanarBody(AbstractBody):
         mass = positive(f"'{name}'", "`mass`", mass)
         squared = xp.sum(along**2)
         if shape is None:
-            length = xp.sqrt(squared)
-            shape = Capsule(SLENDER * length, length)
+            shape = Capsule(None, xp.sqrt(squared))
         return PlanarBody(
             name,
             mass,

@@ -254,6 +254,100 @@ class Scene:
         parts = Parts(self._kinds, self._ends, shapes)
         return motion_of(self._layout, rows, times, numbers, parts)
 
+    def draw(
+        self,
+        sol: Solution | ConsistentStart | Equilibrium | State | None = None,
+        times: Vector | None = None,
+        args: Parameters | None = None,
+        *,
+        ax: Any = None,
+        traces: Sequence[Any] = (),
+        names: bool = False,
+        units: dict[str, str] | None = None,
+    ) -> Any:
+        """A picture of the scene: bodies with their shapes, joints, springs and dampers.
+
+        **Arguments:**
+
+        - `sol`, `args`: as for `motion`. Of a run the last row that it reached is drawn.
+        - `times`: of a run, the times to draw instead. Earlier ones are paler.
+        - `ax`: axes of matplotlib, by default new ones; in space those with
+          `projection="3d"`.
+        - `traces`: points whose paths along the run are drawn: names of bodies, for their
+          mass centres, or pairs `(body, point)` with a point in the frame of the body.
+        - `names`: whether the names of bodies and joints are written.
+        - `units`: names for the labels, such as `{"length": "m"}`.
+
+        **Returns:** the axes.
+
+        **Raises:** as `motion`, and `ValueError` or `TypeError` for axes that do not fit
+        and for traces of what is no body.
+        """
+        from ._drawing import draw
+
+        whole = self.motion(sol, None, args)
+        shown = self.motion(sol, whole.ts[-1:] if times is None else times, args)
+        return draw(shown, whole, ax, traces, names, units)
+
+    def animate(
+        self,
+        sol: Solution,
+        args: Parameters | None = None,
+        *,
+        speed: float = 1.0,
+        fps: float = 25.0,
+        ax: Any = None,
+        traces: Sequence[Any] = (),
+        energy: bool = False,
+        units: dict[str, str] | None = None,
+    ) -> Any:
+        """A film of a run, with frames at equal times whatever its steps were.
+
+        Notebooks show it as a player, and `scene.animate(sol).save("run.gif")` writes a
+        file. Between rows the motion is interpolated as by `motion`.
+
+        **Arguments:**
+
+        - `sol`: a run whose unit of time is the second, of which the rows that it reached
+          are shown.
+        - `args`: those of the run if they are not those of the scene.
+        - `speed`: of the film, relative to the motion: 0.1 shows it ten times slower.
+        - `fps`: frames per second.
+        - `ax`, `traces`, `units`: as for `draw`.
+        - `energy`: whether the energies are plotted beside the scene.
+
+        **Returns:** an `enerjax.Animation`.
+
+        **Raises:** as `draw`, and `ValueError` for a run that is too short or too long for
+        a film at this speed.
+        """
+        from .._pictures import frame_times
+        from ._drawing import animate
+
+        whole = self.motion(sol, None, args)
+        times = frame_times(whole.ts[0], whole.ts[-1], speed, fps)
+        shown = self.motion(sol, times, args)
+        return animate(shown, sol, ax, fps, speed, traces, energy, units)
+
+    def plot_reactions(
+        self,
+        sol: Solution,
+        joint: str,
+        args: Parameters | None = None,
+        *,
+        ax: Any = None,
+        units: dict[str, str] | None = None,
+    ) -> Any:
+        """The force and torque of a joint or drive over time; see `reaction`.
+
+        `units` are names for the labels, such as `{"time": "s", "force": "N"}`; torques
+        have an axis at the right. **Returns:** the axes.
+        """
+        from ._drawing import plot_reaction
+
+        found = self.reaction(sol, joint, args)
+        return plot_reaction(sol, found, joint, ax, units)
+
     def multipliers(
         self, sol: Solution | ConsistentStart | Equilibrium, joint: str
     ) -> Float[Array, "... rows"]:

@@ -24,8 +24,6 @@ from ._rotations import rotation_matrix
 # A name that matplotlib knows, "#rrggbb", or three or four numbers from 0 to 1.
 Color = TypeAliasType("Color", str | Sequence[float])
 
-# The radius of a rod whose thickness is not known, over its length.
-SLENDER = 0.03
 _SIDES = 20  # of the polygons that stand for circles
 
 
@@ -200,7 +198,7 @@ class Capsule(AbstractShape):
 
     **Arguments:**
 
-    - `radius`: positive (length).
+    - `radius`: positive (length), or `None`, where the scene chooses one for all its rods.
     - `length`: of the line, positive; the rod is longer by twice the radius.
     - `position`, `rotation`, `color`: as for `Box`. `Capsule.between` is an alternative.
     """
@@ -210,27 +208,40 @@ class Capsule(AbstractShape):
 
     def __init__(
         self,
-        radius: Real,
+        radius: Real | None,
         length: Real,
         position: Vector | None = None,
         rotation: Vector | Real | None = None,
         *,
         color: Color | None = None,
     ):
-        self.radius = positive("a Capsule", "`radius`", radius)
+        given = radius is not None
+        self.radius = positive("a Capsule", "`radius`", radius) if given else None
         self.length = positive("a Capsule", "`length`", length)
         pose = _pose("Capsule", position, rotation)
         (self.position, self.rotation), self.color = pose, _color("Capsule", color)
 
     @staticmethod
     def between(
-        start: Vector, end: Vector, radius: Real, *, color: Color | None = None
+        start: Vector,
+        end: Vector,
+        radius: Real | None = None,
+        *,
+        color: Color | None = None,
     ) -> "Capsule":
         """A rod whose line has these ends, points of the body."""
         length, middle, axes = _along("Capsule", start, end)
         if middle.size == 2:  # a rotation by an angle
             axes = module_of(axes).arctan2(axes[1, 0], axes[0, 0])
         return Capsule(radius, length, middle, axes, color=color)
+
+    def with_radius(self, radius: float) -> "Capsule":
+        """The same with this radius if it has none."""
+        if self.radius is not None:
+            return self
+        return eqx.tree_at(
+            lambda x: x.radius, self, np.asarray(radius), is_leaf=lambda x: x is None
+        )
 
     def own_facets(self) -> Facets:
         return _rounded(float(self.radius), float(self.length), self.position.size)
