@@ -21,6 +21,7 @@ TESTS = sorted(pathlib.Path(__file__).parent.glob("*.py"))
 # The rooms of the package; each imports only from lower ones, which stand further up.
 LAYERS = [
     {"_types", "_progress"},
+    {"_pictures"},
     {"_programs"},
     {"_files", "_results", "_discrete", "_solvers"},
     {"_system"},
@@ -183,7 +184,7 @@ def test_problems_are_made_of_what_users_have():
 
 
 def test_scenes_stand_on_what_users_have():
-    public = {"_types", "_programs", "_system", "_analysis", "_run"}
+    public = {"_types", "_programs", "_results", "_system", "_analysis", "_run"}
     assert rooms_imported("scenes") <= public
 
 

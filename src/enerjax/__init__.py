@@ -72,6 +72,7 @@ from .scenes import (
     Reaction as Reaction,
     Readout as Readout,
     Scene as Scene,
+    shapes as shapes,
 )
 from .schemes import (
     AbstractScheme as AbstractScheme,

@@ -165,6 +165,29 @@ class Solution(eqx.Module):
         """
         return dataset(self)
 
+    def plot(self, axes: Any = None, *, units: dict[str, str] | None = None) -> Any:
+        """Four plots of the run: energies, what changed their sum since the start, the
+        largest residuals of constraints, and the iterations of the steps.
+
+        **Arguments:**
+
+        - `axes`: four axes of matplotlib to draw into; new ones by default.
+        - `units`: names for the labels, such as `{"time": "s", "energy": "J"}`.
+
+        **Returns:** the axes. A run that failed is shown as far as it came.
+
+        **Raises:** `ValueError` for a batch of runs, and for a run without rows.
+        """
+        from .plots import plot_run
+
+        return plot_run(self, axes, units)
+
+    def plot_energy(self, ax: Any = None, *, units: dict[str, str] | None = None) -> Any:
+        """The energies over time, in one axes object, which is returned; see `plot`."""
+        from .plots import plot_energy
+
+        return plot_energy(self, ax, units)
+
     def __str__(self) -> str:
         return _report(self) if is_known(self) else repr(self)
 

@@ -1,6 +1,12 @@
 """Bodies, joints, forces and drives that compile to the functions of a `System`."""
 
-from . import bodies as bodies, drives as drives, forces as forces, joints as joints
+from . import (
+    bodies as bodies,
+    drives as drives,
+    forces as forces,
+    joints as joints,
+    shapes as shapes,
+)
 from ._body_coordinates import quaternion_rates as quaternion_rates, rotation as rotation
 from ._ends import Ends as Ends
 from ._frames import Frame as Frame
@@ -18,6 +24,11 @@ from ._measures import (
     Separation as Separation,
     Slide as Slide,
     Turn as Turn,
+)
+from ._motion import (
+    BodyMotion as BodyMotion,
+    LinkMotion as LinkMotion,
+    Motion as Motion,
 )
 from ._parameters import Parameters as Parameters
 from ._readouts import Readout as Readout

@@ -3,6 +3,10 @@
 The origin of a body frame is the mass centre. Poses and velocities are those of the start,
 in space; points, axes and inertias are in the frame of the body. Velocities that are left
 out follow from the others and the joints.
+
+`shape` is what pictures show of a body: one of `ej.shapes`, or a list of them, which is
+empty if the body is not to be seen. By default it follows from the joints and the inertia:
+see `docs/pictures.md`.
 """
 
 import abc
@@ -22,6 +26,7 @@ from ._body_coordinates import (
 from ._frames import Numbers
 from ._part import only_parts
 from ._rotations import mass_and_inertia, quaternion_of, rotation_matrix
+from .shapes import AbstractShape, as_shapes, Capsule, Shape
 
 
 class AbstractBody(eqx.Module):
@@ -30,6 +35,7 @@ class AbstractBody(eqx.Module):
     - `numbers`: mass and inertia, the entries of `args["bodies"][name]`.
     - `q`, `v`: its coordinates and velocities at the start.
     - `prescribed`: which velocities the user has passed; the others are zeros.
+    - `shapes`: of pictures; `None` if the user has passed none.
     """
 
     name: str
@@ -37,6 +43,7 @@ class AbstractBody(eqx.Module):
     q: Any
     v: Any
     prescribed: tuple[bool, ...]
+    shapes: tuple[AbstractShape, ...] | None
 
     @property
     @abc.abstractmethod
@@ -58,9 +65,15 @@ class PointMass(AbstractBody):
     """
 
     def __init__(
-        self, name: str, mass: Real, position: Vector, velocity: Vector | None = None
+        self,
+        name: str,
+        mass: Real,
+        position: Vector,
+        velocity: Vector | None = None,
+        *,
+        shape: Shape | None = None,
     ):
-        self.name = name
+        self.name, self.shapes = name, as_shapes(f"'{name}'", shape)
         self.numbers = dict(mass=positive(f"'{name}'", "`mass`", mass))
         self.q = number(f"'{name}'", "`position`", position, (2,), (3,))
         self.v, self.prescribed = velocities(f"'{name}'", (velocity, self.q.shape))
@@ -94,9 +107,10 @@ class PlanarBody(AbstractBody):
         *,
         velocity: Vector | None = None,
         angular_velocity: Real | None = None,
+        shape: Shape | None = None,
     ):
         part = f"'{name}'"
-        self.name = name
+        self.name, self.shapes = name, as_shapes(part, shape)
         self.numbers = dict(
             mass=positive(part, "`mass`", mass),
             inertia=positive(part, "`inertia`", inertia),
@@ -117,6 +131,8 @@ class PlanarBody(AbstractBody):
         end: Vector,
         velocity: Vector | None = None,
         angular_velocity: Real | None = None,
+        *,
+        shape: Shape | None = None,
     ) -> "PlanarBody":
         """A uniform slender rod between two points of the plane.
 
@@ -127,14 +143,18 @@ class PlanarBody(AbstractBody):
         xp = module_of(along)
         turned = xp.arctan2(along[1], along[0])
         mass = positive(f"'{name}'", "`mass`", mass)
+        squared = xp.sum(along**2)
+        if shape is None:
+            shape = Capsule(None, xp.sqrt(squared))
         return PlanarBody(
             name,
             mass,
-            mass * xp.sum(along**2) / 12,
+            mass * squared / 12,
             first + along / 2,
             turned,
             velocity=velocity,
             angular_velocity=angular_velocity,
+            shape=shape,
         )
 
 
@@ -172,8 +192,9 @@ class RigidBody(AbstractBody):
         *,
         velocity: Vector | None = None,
         angular_velocity: Vector | None = None,
+        shape: Shape | None = None,
     ):
-        self.name = name
+        self.name, self.shapes = name, as_shapes(f"'{name}'", shape)
         self.numbers = mass_and_inertia(name, mass, inertia, may_be_flat=False)
         axes = rotation_matrix(name, rotation).T
         self.q = joined(number(f"'{name}'", "`position`", position, (3,)), axes)
@@ -206,8 +227,9 @@ class QuaternionBody(AbstractBody):
         *,
         velocity: Vector | None = None,
         angular_velocity: Vector | None = None,
+        shape: Shape | None = None,
     ):
-        self.name = name
+        self.name, self.shapes = name, as_shapes(f"'{name}'", shape)
         self.numbers = mass_and_inertia(name, mass, inertia, may_be_flat=True)
         matrix, part = rotation_matrix(name, rotation), f"'{name}'"
         position = number(part, "`position`", position, (3,))

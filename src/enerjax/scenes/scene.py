@@ -16,10 +16,12 @@ from .._types import Coordinates, Real, Vector
 from ._columns import of_bodies, of_reaction, of_readout
 from ._compile import compile_parts, join, sort_parts
 from ._constraint_rows import check_reacting, row_names, rows_of
+from ._default_shapes import all_shapes, given_shapes
 from ._feedback import measures_of, Moving
 from ._functions import make_system
 from ._gaps import Gap, Measured
 from ._law_checks import check_laws
+from ._motion import Motion, motion_of, numbers_by_name, Parts, states_of
 from ._parameters import Parameters
 from ._pose_view import View
 from ._readouts import measured_along, Readout
@@ -30,6 +32,7 @@ from .bodies import AbstractBody
 from .drives import AbstractDrive
 from .forces import AbstractForce
 from .joints import AbstractJoint
+from .shapes import Shape
 
 
 class Scene:
@@ -56,6 +59,8 @@ class Scene:
     - `args`: numbers for your own functions, which find them by name in the `args` of the
       system.
     - `redundant`: whether joints may be redundant; see `System`.
+    - `ground`: shapes of what is fixed in space, for pictures, such as a floor: one of
+      `ej.shapes`, or a list of them.
 
     A scene is immutable. `system` is passed to `simulate`, `args` are its `Parameters`, and
     `q` and `v` are the start before joints are closed. Parts of a kind are evaluated
@@ -79,6 +84,7 @@ class Scene:
         args: dict[str, Any] | None = None,
         *,
         redundant: bool = False,
+        ground: Shape = (),
     ):
         found = sort_parts(parts)
         bodies: list[AbstractBody] = found[AbstractBody]
@@ -89,6 +95,7 @@ class Scene:
             for part in found[kind]
         }
         self._kinds = {part.name: type(part).__name__ for part in parts}
+        self._shapes = given_shapes(bodies, ground)
         self.q, self.v = (join([getattr(b, x) for b in bodies]) for x in ("q", "v"))
         check_laws(self._layout, self.q, self.args)
         self._rows = rows_of(self._layout, self.q, self.args)
@@ -219,6 +226,130 @@ class Scene:
         args, ends = self.args if args is None else args, self._ends[joint]
         of_state = lambda q, x: reaction(self._layout, q, x, joint, ends, args)
         return each(of_state, ys.q, self.multipliers(sol, joint))
+
+    def motion(
+        self,
+        sol: Solution | ConsistentStart | Equilibrium | State | None = None,
+        times: Vector | None = None,
+        args: Parameters | None = None,
+    ) -> Motion:
+        """The poses of all bodies with their shapes, and the places of joints and forces,
+        along a run: all that pictures show, as NumPy arrays.
+
+        **Arguments:**
+
+        - `sol`: a run, of which the rows that it reached count; or one state, by default
+          the poses of the bodies.
+        - `times`: shape `(times,)`, within the rows; by default those of the rows. Between
+          rows positions and rotations are interpolated by their values and rates, with an
+          error of fourth order in the distance of the rows, and a warning if it can be
+          seen.
+        - `args`: those of the run if they are not those of the scene.
+
+        **Raises:** `ValueError` or `TypeError` for states that are not of this scene, a
+        batch, states that are all NaN, times outside of the rows, and too few rows.
+        """
+        args = self.args if args is None else args
+        state = State(self.q, self.v) if sol is None else sol
+        rows = states_of(self._layout, state)
+        numbers = numbers_by_name(self._layout, args)
+        shapes = all_shapes(self._layout, numbers, self.q, self._shapes)
+        parts = Parts(self._kinds, self._ends, shapes)
+        return motion_of(self._layout, rows, times, numbers, parts)
+
+    def draw(
+        self,
+        sol: Solution | ConsistentStart | Equilibrium | State | None = None,
+        times: Vector | None = None,
+        args: Parameters | None = None,
+        *,
+        ax: Any = None,
+        traces: Sequence[Any] = (),
+        names: bool = False,
+        units: dict[str, str] | None = None,
+    ) -> Any:
+        """A picture of the scene: bodies with their shapes, joints, springs and dampers.
+
+        **Arguments:**
+
+        - `sol`, `args`: as for `motion`. Of a run the last row that it reached is drawn.
+        - `times`: of a run, the times to draw instead. Earlier ones are paler.
+        - `ax`: axes of matplotlib, by default new ones; in space those with
+          `projection="3d"`.
+        - `traces`: points whose paths along the run are drawn: names of bodies, for their
+          mass centres, or pairs `(body, point)` with a point in the frame of the body.
+        - `names`: whether the names of bodies and joints are written.
+        - `units`: names for the labels, such as `{"length": "m"}`.
+
+        **Returns:** the axes.
+
+        **Raises:** as `motion`, and `ValueError` or `TypeError` for axes that do not fit
+        and for traces of what is no body.
+        """
+        from ._drawing import draw
+
+        whole = self.motion(sol, None, args)
+        shown = self.motion(sol, whole.ts[-1:] if times is None else times, args)
+        return draw(shown, whole, ax, traces, names, units)
+
+    def animate(
+        self,
+        sol: Solution,
+        args: Parameters | None = None,
+        *,
+        speed: float = 1.0,
+        fps: float = 25.0,
+        ax: Any = None,
+        traces: Sequence[Any] = (),
+        energy: bool = False,
+        units: dict[str, str] | None = None,
+    ) -> Any:
+        """A film of a run, with frames at equal times whatever its steps were.
+
+        Notebooks show it as a player, and `scene.animate(sol).save("run.gif")` writes a
+        file. Between rows the motion is interpolated as by `motion`.
+
+        **Arguments:**
+
+        - `sol`: a run whose unit of time is the second, of which the rows that it reached
+          are shown.
+        - `args`: those of the run if they are not those of the scene.
+        - `speed`: of the film, relative to the motion: 0.1 shows it ten times slower.
+        - `fps`: frames per second.
+        - `ax`, `traces`, `units`: as for `draw`.
+        - `energy`: whether the energies are plotted beside the scene.
+
+        **Returns:** an `enerjax.Animation`.
+
+        **Raises:** as `draw`, and `ValueError` for a run that is too short or too long for
+        a film at this speed.
+        """
+        from .._pictures import frame_times
+        from ._drawing import animate
+
+        whole = self.motion(sol, None, args)
+        times = frame_times(whole.ts[0], whole.ts[-1], speed, fps)
+        shown = self.motion(sol, times, args)
+        return animate(shown, sol, ax, fps, speed, traces, energy, units)
+
+    def plot_reactions(
+        self,
+        sol: Solution,
+        joint: str,
+        args: Parameters | None = None,
+        *,
+        ax: Any = None,
+        units: dict[str, str] | None = None,
+    ) -> Any:
+        """The force and torque of a joint or drive over time; see `reaction`.
+
+        `units` are names for the labels, such as `{"time": "s", "force": "N"}`; torques
+        have an axis at the right. **Returns:** the axes.
+        """
+        from ._drawing import plot_reaction
+
+        found = self.reaction(sol, joint, args)
+        return plot_reaction(sol, found, joint, ax, units)
 
     def multipliers(
         self, sol: Solution | ConsistentStart | Equilibrium, joint: str
