@@ -68,7 +68,7 @@ def run(
         if works
         else (chosen.quick,)
     )
-    _pin()
+    pin()
     if chosen.mode is not None:
         if chosen.mode == "fast":
             ej.enable_fast_loops()
@@ -109,7 +109,7 @@ def _options(doc: str, works: Sequence[str]) -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _pin() -> None:
+def pin() -> None:
     """Restricts this process to one core, so that times are comparable."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})

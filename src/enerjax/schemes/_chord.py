@@ -42,6 +42,24 @@ def step_chord(rows: Increment, constraints: ConstraintMatrix) -> Increment:
     )
 
 
+def rattle_chord(rows: Increment, constraints: ConstraintMatrix) -> Increment:
+    """The correction of a step of RATTLE, whose coordinates are not redundant; it solves
+
+    M rate + C^T impulse / 2 = r_m
+    C rate = r_phi,   C rate - G velocity_impulse / 2 = r_psi
+    """
+    free = constraints.inverse_inertia @ rows.rate
+    before = constraints.product(free) - rows.impulse
+    right = jnp.stack([before, rows.impulse - rows.velocity_impulse])
+    before, after = constraints.solve(right)
+    return Increment(
+        impulse=2 * before,
+        rate=free - constraints.velocity(before),
+        momentum=rows.momentum,
+        velocity_impulse=2 * after,
+    )
+
+
 def jump_chord(
     alpha: Scalar, rows: JumpAndEnd, constraints: ConstraintMatrix
 ) -> JumpAndEnd:

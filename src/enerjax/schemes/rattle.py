@@ -1,12 +1,13 @@
 import equinox as eqx
 
-from .._operators import AbstractModel, Increment
+from .._operators import AbstractModel, ConstraintMatrix, Increment
 from .._system import State
 from .._types import Coordinates, Multipliers, Scalar, Velocities
-from .base import AbstractOneSolveScheme, Formulation, StepEnd, StepProblem
+from ._chord import rattle_chord
+from .base import AbstractSchemeWithChord, Formulation, StepEnd, StepProblem
 
 
-class Rattle(AbstractOneSolveScheme[Increment, StepProblem]):
+class Rattle(AbstractSchemeWithChord[Increment, StepProblem]):
     """RATTLE: the constrained leapfrog (Stormer-Verlet) scheme; for comparison.
 
     With the velocity `V` in the middle of the step and the forces `F = -grad V + f`,
@@ -58,6 +59,14 @@ class Rattle(AbstractOneSolveScheme[Increment, StepProblem]):
         pulled = self._pulled(problem, start.q, middle, start.t, z.impulse)
         balance = problem.separable_model.inertia @ (middle - start.v) + 0.5 * pulled
         return problem.rows_of_balance(balance, self._end(z, problem))
+
+    def constraint_matrix(self, z: Increment, problem: StepProblem) -> ConstraintMatrix:
+        return problem.constraint_matrix(z)
+
+    def chord(
+        self, rows: Increment, problem: StepProblem, constraints: ConstraintMatrix
+    ) -> Increment:
+        return rattle_chord(rows, constraints)
 
     def finish(self, z: Increment, problem: StepProblem) -> StepEnd:
         end = self._end(z, problem)
