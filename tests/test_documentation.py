@@ -32,8 +32,6 @@ def with_code():
 def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
     """A page is read from top to bottom: later blocks use names of earlier ones."""
     monkeypatch.chdir(tmp_path)
-    # This process has started its CPU back end, which reads its settings only once.
-    monkeypatch.setattr(ej, "enable_fast_loops", lambda: None)
     names = {}
     for mark, code in code_blocks(page):
         if not mark:
