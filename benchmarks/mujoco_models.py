@@ -54,7 +54,7 @@ class Model:
         rates, bodies = [], self.mechanism.in_motion().bodies
         for joint, body in zip(self.mechanism.joints, bodies, strict=True):
             before = np.zeros(3) if joint.first == GROUND else bodies[joint.first].spin
-            turn = body.spin - before
+            turn = np.asarray(body.spin) - before
             rates += list(turn) if joint.axis is None else [turn @ joint.axis]
         return np.array(rates)
 

@@ -225,7 +225,7 @@ def _all_rows(names: list[str], rounds: int) -> Iterator[tuple[str, Record]]:
 def main() -> None:
     options = _options()
     harness.pin()
-    names = options.only or (QUICK if options.quick else list(WORKS))
+    names = list(options.only or (QUICK if options.quick else WORKS))
     rounds = QUICK_ROUNDS if options.quick else ROUNDS
     path = options.out / "portfolio.json"
     options.out.mkdir(parents=True, exist_ok=True)

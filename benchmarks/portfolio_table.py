@@ -17,7 +17,9 @@ def table(found: Record) -> str:
     """Markdown: a row for each motion, and below it why it misses its aims."""
     lines = [_line(_HEAD), _line(["---"] * len(_HEAD))]
     lines += [_line(_cells(row)) for row in found["rows"]]
-    misses = [f"- `{row['work']}`: {miss}" for row in found["rows"] for miss in _misses(row)]
+    misses = [
+        f"- `{row['work']}`: {miss}" for row in found["rows"] for miss in _misses(row)
+    ]
     if misses:
         lines += ["", "What misses its aim, and why:", "", *misses]
     if found["scripts"]:
@@ -87,7 +89,9 @@ def _misses(row: Record) -> Iterator[str]:
     if is_slow:
         each = us / max(row["corrections"], 1e-9)
         obstacles = row["obstacles"]
-        way = f"no single function ({'; '.join(obstacles)})" if obstacles else "one function"
+        way = (
+            f"no single function ({'; '.join(obstacles)})" if obstacles else "one function"
+        )
         yield (
             f"time: {row['corrections']:.1f} corrections of {_number(each)} us, "
             f"{row['unknowns']} unknowns, {row['operations']} operations an evaluation; "
@@ -132,7 +136,11 @@ def draw(rows: list[Record], path: Path) -> None:
     panels = (
         ("time of a step / EXUDYN's", "ratio", _ratio),
         ("first call, s", "first_call", lambda row: row.get("first_call_s")),
-        ("gradient / run", "gradient_ratio", lambda row: row.get("gradient", {}).get("ratio")),
+        (
+            "gradient / run",
+            "gradient_ratio",
+            lambda row: row.get("gradient", {}).get("ratio"),
+        ),
     )
     figure, axes = plt.subplots(1, 3, figsize=(13, 0.22 * len(rows) + 1), sharey=True)
     names = [row["work"] for row in rows]

@@ -136,8 +136,12 @@ def _points_at(masses: np.ndarray, length: float, end: float) -> np.ndarray:
     y = np.zeros((2, masses.size, 2))
     y[0, :, 0] = length * np.arange(1, masses.size + 1)
     rates = lambda t, y: chain_rates(y, masses)
-    options = dict(method="DOP853", rtol=1e-11, atol=1e-13)
-    return solve_ivp(rates, (0, end), y.ravel(), **options).y[: 2 * masses.size, -1].reshape(-1, 2)
+    options: dict[str, Any] = dict(method="DOP853", rtol=1e-11, atol=1e-13)
+    return (
+        solve_ivp(rates, (0, end), y.ravel(), **options)
+        .y[: 2 * masses.size, -1]
+        .reshape(-1, 2)
+    )
 
 
 def _points(
@@ -166,7 +170,9 @@ def _pendulum(name: str, scheme: str, bars: Bars) -> Work:
         name=name,
         problem=lambda: ej.problems.chain(2, length=2.0, mass=2.0),
         h=h,
-        reference=lambda: solve(STRETCHED_DOUBLE_PENDULUM, _UNIT_PENDULUM, end).q[-1].reshape(2, 2),
+        reference=lambda: (
+            solve(STRETCHED_DOUBLE_PENDULUM, _UNIT_PENDULUM, end).q[-1].reshape(2, 2)
+        ),
         exudyn=lambda exudyn: exudyn.points((1.0, 1.0), 1.0, 0.9),
         diffrax=True,
         bars=bars,

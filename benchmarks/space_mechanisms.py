@@ -62,7 +62,7 @@ class Mechanism:
         name = lambda k: "ground" if k == GROUND else f"body {k}"
         parts: list[Any] = []
         for k, body in enumerate(self.bodies):
-            given = dict(velocity=body.velocity, angular_velocity=body.spin)
+            given: dict[str, Any] = dict(velocity=body.velocity, angular_velocity=body.spin)
             at = (body.mass, body.inertia, body.position)
             parts.append(ej.bodies.RigidBody(name(k), *at, **given))
         for k, joint in enumerate(self.joints):
@@ -111,9 +111,7 @@ def _torques(number: int, joint: Joint, ends: tuple[str, str]) -> list[Any]:
         )
     if joint.torque:
         torque = lambda t, args: args[f"torque {number}"] * jnp.ones_like(t)
-        parts.append(
-            ej.forces.TorsionActuator(f"motor {number}", *ends, torque, **around)
-        )
+        parts.append(ej.forces.TorsionActuator(f"motor {number}", *ends, torque, **around))
     return parts
 
 
@@ -159,7 +157,7 @@ def whirling_chain(num_bodies: int, rate: float = 20.0) -> Mechanism:
     The signs are such that no body turns faster than the square root of two times `rate`.
     """
     signs = np.resize([1, 1, -1, -1, -1, -1, 1, 1], num_bodies)
-    return with_rates(chain(num_bodies), rate * signs)
+    return with_rates(chain(num_bodies), (rate * signs).tolist())
 
 
 def tree(num_bodies: int) -> Mechanism:
