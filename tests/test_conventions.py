@@ -184,7 +184,7 @@ def test_problems_are_made_of_what_users_have():
 
 
 def test_scenes_stand_on_what_users_have():
-    public = {"_types", "_programs", "_results", "_system", "_analysis", "_run"}
+    public = {"_types", "_pictures", "_programs", "_system", "_analysis", "_run"}
     assert rooms_imported("scenes") <= public
 
 

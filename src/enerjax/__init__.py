@@ -52,6 +52,7 @@ from ._system import (
     State as State,
     System as System,
 )
+from ._tools.animate import animate as animate
 from ._tools.diffrax import IndexReduced as IndexReduced, to_diffrax as to_diffrax
 from ._tools.explain import explain as explain, Explanation as Explanation
 from ._tools.identify import Fit as Fit, fit as fit, MultipleShooting as MultipleShooting

@@ -1,15 +1,13 @@
 """Pictures: axes, polygons and lines in the plane and in space, and films.
 
-This room imports matplotlib, so it is imported only where a picture is made.
+This room knows no mechanics. It imports matplotlib, so it is itself imported only where a
+picture is made.
 """
 
 from .animation import Animation as Animation, frame_times as frame_times
 from .axes import (
     axes_of as axes_of,
-    checked as checked,
-    clock as clock,
     grid_of as grid_of,
-    in_space as in_space,
     label as label,
     legend_above as legend_above,
     tell as tell,
@@ -18,10 +16,18 @@ from .axes import (
 from .canvas import (
     AbstractCanvas as AbstractCanvas,
     color_of as color_of,
-    Dot as Dot,
     Drawing as Drawing,
     Faces as Faces,
     Path as Path,
-    PlaneCanvas as PlaneCanvas,
-    SpaceCanvas as SpaceCanvas,
+)
+from .film import canvas_of as canvas_of, film as film, joint_bounds as joint_bounds
+from .geometry import (
+    as_quadrilaterals as as_quadrilaterals,
+    straight as straight,
+    tube as tube,
+)
+from .symbols import (
+    GREY as GREY,
+    PlaneSymbols as PlaneSymbols,
+    SpaceSymbols as SpaceSymbols,
 )

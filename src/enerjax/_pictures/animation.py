@@ -121,6 +121,9 @@ class Animation:
         # The colours of a few frames, one above the other, are those of all.
         some = list(self._rendered((0, count // 2, count - 1), dpi))
         palette = Image.fromarray(np.concatenate(some)).quantize(_COLORS)
+        # A mean of colours that are almost white is a grey page.
+        levels = np.array(palette.getpalette())
+        palette.putpalette(np.where(levels > 248, 255, levels).tolist())
         return [
             Image.fromarray(x).quantize(palette=palette, dither=Image.Dither.NONE)
             for x in self._rendered(range(count), dpi)

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgba
 from mpl_toolkits.mplot3d import proj3d
-from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from .geometry import normals
 
@@ -56,7 +56,8 @@ class Dot(NamedTuple):
 
 
 class Drawing(NamedTuple):
-    """All that a picture shows at one time, from back to front."""
+    """All that a picture shows at one time, from back to front. Paths and dots are in the
+    plane only."""
 
     faces: tuple[Faces, ...] = ()
     paths: tuple[Path, ...] = ()
@@ -180,19 +181,20 @@ class PlaneCanvas(AbstractCanvas):
 
 
 class SpaceCanvas(AbstractCanvas):
-    """A picture in space. Polygons are ordered by the depth of their middles, so they all
-    are in one collection, and lines are thin tubes."""
+    """A picture in space, all of faces, quadrilaterals `(m, 4, 3)`.
+
+    These are ordered by the depth of their middles, which matplotlib does only within one
+    collection of polygons. So lines are thin tubes.
+    """
 
     def __init__(self, ax: Any):
         super().__init__(ax)
         faces = Poly3DCollection(np.zeros((1, 4, 3)))
         self._faces = ax.add_collection3d(faces, autolim=False)
-        paths = Line3DCollection(np.zeros((1, 2, 3)))
-        self._paths = ax.add_collection3d(paths, autolim=False)
 
     @property
     def artists(self) -> list[Artist]:
-        return [self._paths, self._faces]
+        return [self._faces]
 
     def show(self, drawing: Drawing) -> None:
         quads, colors = [np.zeros((0, 4, 3))], [np.zeros((0, 4))]
@@ -207,13 +209,6 @@ class SpaceCanvas(AbstractCanvas):
         self._faces.set_verts(np.concatenate(quads))
         # Edges in the colour of their face close the seams between faces.
         self._faces.set(facecolor=shaded, edgecolor=shaded, linewidth=0.3)
-        paths = drawing.paths
-        self._paths.set_segments([x.points for x in paths])
-        self._paths.set(
-            color=[x.color for x in paths],
-            linewidth=[x.width for x in paths],
-            linestyle=["--" if x.dashed else "-" for x in paths],
-        )
 
     def frame(self, low: Array, high: Array) -> None:
         ax: Any = self.ax

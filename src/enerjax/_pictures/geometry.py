@@ -116,3 +116,15 @@ def straight(start: np.ndarray, end: np.ndarray, longest: float) -> np.ndarray:
     count = max(1, int(np.ceil(np.linalg.norm(end - start) / longest)))
     s = np.linspace(0, 1, min(count, 40) + 1)[:, None]
     return start + s * (end - start)
+
+
+def ball(radius: float, sides: int = 10) -> np.ndarray:
+    """Quadrilaterals of a sphere about the origin, `(n, 4, 3)`."""
+    turn = np.linspace(0, 2 * np.pi, sides + 1)
+    rise = np.linspace(-np.pi / 2, np.pi / 2, sides // 2 + 1)[:, None]
+    grid = radius * np.stack(
+        [np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise + 0 * turn)],
+        axis=-1,
+    )
+    quads = [grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]]
+    return np.stack(quads, axis=2).reshape(-1, 4, 3)

@@ -1,6 +1,12 @@
 from .audit import Audit as Audit
 from .controller import StepController as StepController
 from .inputs import positive_integer as positive_integer
+from .reached import (
+    must_be_close as must_be_close,
+    must_be_known as must_be_known,
+    ReachedRows as ReachedRows,
+    warn_if_visible as warn_if_visible,
+)
 from .saving import SaveAt as SaveAt
 from .simulate import simulate as simulate
 from .solution import Solution as Solution, Statistics as Statistics

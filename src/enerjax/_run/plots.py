@@ -1,65 +1,21 @@
 """Plots of a run: its energies, the account of their changes, constraints and steps."""
 
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 
 from .._pictures import axes_of, grid_of, label, legend_above, tell, Units
-from .._programs import is_known
-from .._results import tally
+from .audit import Audit
+from .reached import ReachedRows
+from .solution import Solution, Statistics
 
 
-if TYPE_CHECKING:  # `Solution` has these plots as methods
-    from .solution import Solution
-
-
-class RowsOfRun:
-    """The rows that a run reached, as NumPy arrays.
-
-    **Raises:** `TypeError` for traced values, `ValueError` for a batch, and for a run
-    without rows.
-    """
-
-    def __init__(self, sol: "Solution"):
-        if not is_known(sol):
-            raise TypeError(
-                "Pictures need values: they cannot be made inside `jit`, `vmap` or `grad`."
-            )
-        if np.ndim(sol.ts) != 1:
-            raise ValueError(
-                f"A picture is of one run, but the times have the shape {sol.ts.shape}. "
-                "Pick a run of a batch: `jax.tree.map(lambda x: x[3], sol)`."
-            )
-        self.audit, self.stats = sol.audit, sol.stats
-        self.outcome = tally(sol.result).removeprefix("1 ")
-        self.reached = np.isfinite(self.audit.energy) & np.isfinite(sol.ts)
-        if not self.reached.any():
-            raise ValueError(
-                f"The run has no rows to plot: all are NaN. Its outcome: {self.outcome}."
-            )
-        self.ts = np.asarray(sol.ts)[self.reached]
-
-    @property
-    def failed(self) -> bool:
-        return self.outcome != "successful"
-
-    def __call__(self, values: Any) -> np.ndarray:
-        """The reached rows of an array with the axis of time first."""
-        return np.asarray(values)[self.reached]
-
-    def after_start(self, values: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Times and values of an array that may lack the row of the start."""
-        values = np.asarray(values)
-        reached = self.reached[-len(values) :] if len(values) else self.reached[:0]
-        return self.ts[len(self.ts) - reached.sum() :], values[reached]
-
-
-def plot_energy(sol: "Solution", ax: Any, units: Units | None) -> Axes:
+def plot_energy(sol: Solution, ax: Any, units: Units | None) -> Axes:
     """Kinetic, potential and total energy."""
-    rows, ax = RowsOfRun(sol), axes_of(ax)
+    rows, ax, audit = ReachedRows(sol), axes_of(ax), sol.audit
     for name, color in (("kinetic", "C0"), ("potential", "C2"), ("energy", "k")):
-        values = rows(getattr(rows.audit, name))
+        values = rows(getattr(audit, name))
         ax.plot(rows.ts, values, color, label="total" if name == "energy" else name)
     ax.set(xlabel=label("time", units), ylabel=label("energy", units))
     _say_the_end(rows, ax)
@@ -67,22 +23,21 @@ def plot_energy(sol: "Solution", ax: Any, units: Units | None) -> Axes:
     return ax
 
 
-def plot_run(sol: "Solution", axes: Any, units: Units | None) -> np.ndarray:
+def plot_run(sol: Solution, axes: Any, units: Units | None) -> np.ndarray:
     """Energies, their account, constraints and steps in four axes."""
-    rows = RowsOfRun(sol)
+    rows = ReachedRows(sol)
     grid = grid_of(axes, 4, (9.0, 6.0))
     plot_energy(sol, grid[0], units)
-    _account(rows, grid[1], units)
-    _constraints(rows, grid[2])
-    _steps(rows, grid[3])
+    _account(rows, sol.audit, grid[1], units)
+    _constraints(rows, sol.audit, grid[2])
+    _steps(rows, sol.stats, grid[3])
     for ax in grid:
         ax.set_xlabel(label("time", units))
     return grid if axes is None else np.asarray(axes)
 
 
-def _account(rows: RowsOfRun, ax: Axes, units: Units | None) -> None:
+def _account(rows: ReachedRows, audit: Audit, ax: Axes, units: Units | None) -> None:
     """What changed the energy since the start; only what is not zero throughout."""
-    audit = rows.audit
     energy = rows(audit.energy)
     change = energy - energy[0]
     ax.plot(rows.ts, change, "k", linewidth=4, alpha=0.25, label="change of the energy")
@@ -100,11 +55,11 @@ def _account(rows: RowsOfRun, ax: Axes, units: Units | None) -> None:
     legend_above(ax, 2)
 
 
-def _constraints(rows: RowsOfRun, ax: Axes) -> None:
+def _constraints(rows: ReachedRows, audit: Audit, ax: Axes) -> None:
     """The largest residuals of positions and velocities, in their own units."""
     for name, values in (
-        ("of positions", rows.audit.constraint),
-        ("of velocities", rows.audit.constraint_rate),
+        ("of positions", audit.constraint),
+        ("of velocities", audit.constraint_rate),
     ):
         if values.shape[-1] > 0:
             largest = np.abs(rows(values)).max(axis=1)
@@ -117,9 +72,9 @@ def _constraints(rows: RowsOfRun, ax: Axes) -> None:
     ax.set_ylabel("largest residual")
 
 
-def _steps(rows: RowsOfRun, ax: Axes) -> None:
+def _steps(rows: ReachedRows, stats: Statistics, ax: Axes) -> None:
     """Iterations between rows, and their distance where it varies."""
-    ts, iterations = rows.after_start(rows.stats.newton_iterations)
+    ts, iterations = rows.after_start(stats.newton_iterations)
     ax.plot(ts, iterations, ".", markersize=3, label="iterations")
     ax.set_ylabel("iterations since the row before")
     ax.set_ylim(bottom=0)
@@ -130,8 +85,8 @@ def _steps(rows: RowsOfRun, ax: Axes) -> None:
         beside.set_ylabel("time since the row before", color="C1")
 
 
-def _say_the_end(rows: RowsOfRun, ax: Axes) -> None:
+def _say_the_end(rows: ReachedRows, ax: Axes) -> None:
     """Where and why a run ended before its time."""
-    if rows.failed:
+    if rows.outcome:
         ax.axvline(rows.ts[-1], color="C3", linewidth=1)
         tell(ax, f"ends at t = {rows.ts[-1]:.4g}: {rows.outcome}")

@@ -8,12 +8,20 @@ from .._types import Args, Scalar, Vector, Velocities
 from ..scenes import Scene
 
 
-class Problem(NamedTuple):
-    """A system, a consistent start and `args`: `system, start, args = pendulum()`."""
-
+class _Triple(NamedTuple):
     system: AbstractSystem
     start: State
     args: Args
+
+
+class Problem(_Triple):
+    """A system, a consistent start and `args`: `system, start, args = pendulum()`.
+
+    `scene` is that of a mechanism, for pictures: `four_bar().scene.draw()`; `None` for
+    other systems.
+    """
+
+    scene: Scene | None = None
 
 
 def problem(system: AbstractSystem, q: Vector, v: Vector, args: Args) -> Problem:
@@ -21,7 +29,9 @@ def problem(system: AbstractSystem, q: Vector, v: Vector, args: Args) -> Problem
 
 
 def problem_of(scene: Scene) -> Problem:
-    return Problem(*scene.build())
+    found = Problem(*scene.build())
+    found.scene = scene
+    return found
 
 
 def equal_masses_kinetic(v: Velocities, args: Args) -> Scalar:

@@ -2,24 +2,19 @@
 
 from typing import Any, NamedTuple
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from .._pictures import (
     AbstractCanvas,
     Animation,
     axes_of,
-    checked,
-    clock,
+    canvas_of,
     color_of,
     Drawing,
-    in_space,
+    film,
+    joint_bounds,
     label,
-    Path,
-    PlaneCanvas,
-    SpaceCanvas,
     tell,
     Units,
 )
@@ -88,48 +83,22 @@ def draw(
     `whole` is the motion along which traces are drawn.
     """
     sketch = Sketch(motion, whole)
-    low, high = sketch.bounds()
     paths = _paths(whole, traces_of(traces, motion))
-    for path, _ in paths:
-        low, high = np.minimum(low, path.min(axis=0)), np.maximum(high, path.max(axis=0))
-    canvas = _canvas(ax, low, high, units)
+    bounds = joint_bounds(sketch.bounds(), [path for path, _ in paths])
+    canvas = canvas_of(ax, bounds, units)
     count = len(motion.ts)
-    drawing = Drawing(paths=tuple(Path(path, color, 1.0) for path, color in paths))
+    drawing = Drawing()
+    for path, color in paths:
+        drawing += sketch.trail(path, color)
     for k in range(count):
         drawing += sketch.at(k).faded(0.25 + 0.75 * (k + 1) / count)
-    canvas.frame(low, high)
+    canvas.frame(*bounds)
     canvas.show(drawing)
     if names:
         _write_names(canvas, motion)
     if motion.outcome:
         tell(canvas.ax, f"the run ends at t = {whole.ts[-1]:.4g}: {motion.outcome}")
     return canvas.ax
-
-
-def _canvas(ax: Any, low: Array, high: Array, units: Units | None) -> AbstractCanvas:
-    """A canvas in the axes of the user, or in new ones of a shape that fits."""
-    spatial = len(low) == 3
-    if ax is None and spatial:
-        figure = plt.figure(figsize=(6.0, 5.0), layout="constrained")
-        ax = figure.add_subplot(projection="3d")
-        ax.view_init(elev=22, azim=-55)
-    elif ax is None:
-        ax = axes_of(None, _figsize(low, high))
-    elif in_space(checked(ax)) != spatial:
-        raise ValueError(
-            "This scene is in space: make axes with "
-            "`plt.figure().add_subplot(projection='3d')`."
-            if spatial
-            else "This scene is in the plane, but `ax` are axes in space."
-        )
-    names = ("x", "y", "z")[: len(low)]
-    ax.set(**{f"{name}label": label(name, units, "length") for name in names})
-    return SpaceCanvas(ax) if spatial else PlaneCanvas(ax)
-
-
-def _figsize(low: Array, high: Array) -> tuple[float, float]:
-    ratio = float((high - low)[1] / (high - low)[0])
-    return (6.4, float(np.clip(5.6 * ratio + 0.8, 1.8, 6.0)))
 
 
 def _write_names(canvas: AbstractCanvas, motion: Motion) -> None:
@@ -155,65 +124,21 @@ def animate(
     units: Units | None,
 ) -> Animation:
     """A film of a motion, one frame for each of its times."""
-    sketch, ts = Sketch(motion, motion), motion.ts
-    low, high = sketch.bounds()
+    sketch = Sketch(motion, motion)
     paths = _paths(motion, traces_of(traces, motion))
-    for path, _ in paths:
-        low, high = np.minimum(low, path.min(axis=0)), np.maximum(high, path.max(axis=0))
-    spatial, beside = len(low) == 3, None
-    if ax is None:
-        width, height = (6.0, 5.0) if spatial else _figsize(low, high)
-        ax, beside = _film_axes(spatial, (width, height), energy)
-    elif energy:
-        raise ValueError("`energy=True` makes a figure of its own: leave out `ax`.")
-    canvas = _canvas(ax, low, high, units)
-    canvas.frame(low, high)
-    if motion.outcome:
-        tell(ax, f"the run ends at t = {ts[-1]:.4g}: {motion.outcome}")
-    now = clock(ax, "")
-    marker = None
-    if beside is not None:
-        sol.plot_energy(beside, units=units)
-        marker = beside.axvline(ts[0], color="0.5", linewidth=1)
-    text = _time_text(ts, speed, units)
 
-    def show(k: int) -> None:
-        trails = tuple(Path(path[: k + 1], color, 1.2) for path, color in paths)
-        canvas.show(Drawing(paths=trails if k > 0 else ()) + sketch.at(k))
-        now.set_text(text(ts[k]))
-        if marker is not None:
-            marker.set_xdata([ts[k]])
+    def at(k: int) -> Drawing:
+        drawing = Drawing()
+        for path, color in paths:
+            drawing += sketch.trail(path[: k + 1], color)
+        return drawing + sketch.at(k)
 
-    moving = [*canvas.artists, now, *([] if marker is None else [marker])]
-    return Animation(ax.figure, ts, fps, show, moving)
-
-
-def _film_axes(
-    spatial: bool, size: tuple[float, float], energy: bool
-) -> tuple[Any, Axes | None]:
-    """Axes for a film, with some beside them for energies; no window shows the figure."""
-    width, height = size
-    projection = "3d" if spatial else None
-    if not energy:
-        figure = Figure(size, layout="constrained")
-        ax: Any = figure.add_subplot(projection=projection)
-        beside = None
-    else:
-        figure = Figure((width + 4.0, max(height, 3.4)), layout="constrained")
-        grid = figure.add_gridspec(1, 2, width_ratios=[width, 4.0])
-        ax = figure.add_subplot(grid[0], projection=projection)
-        beside = figure.add_subplot(grid[1])
-    if spatial:
-        ax.view_init(elev=22, azim=-55)
-    return ax, beside
-
-
-def _time_text(ts: Array, speed: float, units: Units | None) -> Any:
-    step = float(ts[1] - ts[0])
-    digits = max(0, int(np.ceil(-np.log10(step))))
-    unit = (units or {}).get("time", "")
-    factor = "" if speed == 1 else f"   (speed x {speed:g})"
-    return lambda t: f"t = {t:.{digits}f} {unit}".rstrip() + factor
+    bounds = joint_bounds(sketch.bounds(), [path for path, _ in paths])
+    return film(
+        at, bounds, motion.ts, ax, fps, speed, units,
+        outcome=motion.outcome,
+        beside=sol.plot_energy if energy else None,
+    )  # fmt: skip
 
 
 def plot_reaction(

@@ -5,16 +5,15 @@ the row before, which is interpolated: a steady spin is exact, and a pose is alw
 The error is of fourth order in the distance of the rows.
 """
 
-import warnings
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .._run import must_be_close, warn_if_visible
 
 
 Array: TypeAlias = np.ndarray
-
-# Errors above this part of the size of the motion are told.
-_VISIBLE = 0.01
 
 
 class Frames(NamedTuple):
@@ -118,15 +117,11 @@ def _rate_of_vector(vector: Array, spin: Array, h: Array) -> Array:
 
 
 def _logarithm(rotation: Array) -> Array:
-    from scipy.spatial.transform import Rotation
-
     flat = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()
     return flat.reshape(*rotation.shape[:-2], 3)
 
 
 def _exponential(vector: Array) -> Array:
-    from scipy.spatial.transform import Rotation
-
     flat = Rotation.from_rotvec(vector.reshape(-1, 3)).as_matrix()
     return flat.reshape(*vector.shape[:-1], 3, 3)
 
@@ -137,12 +132,7 @@ def _warn_if_coarse(ts: Array, rows: Frames) -> None:
     Every other row is interpolated from its neighbours: over twice the distance the error
     is sixteen times as large.
     """
-    if len(ts) < 3:
-        raise ValueError(
-            f"The run has {len(ts)} rows, which do not tell the motion between them: save "
-            "more, all steps with `saveat=ej.SaveAt(every=1)`, or the times that you want "
-            "to see with `SaveAt(ts=...)`."
-        )
+    must_be_close(len(ts))
     middle = np.arange(1, len(ts) - 1)
     before, here, after = (rows.rows(middle + k) for k in (-1, 0, 1))
     h = ts[middle + 1] - ts[middle - 1]
@@ -150,11 +140,4 @@ def _warn_if_coarse(ts: Array, rows: Frames) -> None:
     size = np.ptp(rows.position.reshape(-1, rows.position.shape[-1]), axis=0).max()
     missed = np.abs(found.position - here.position).max() / (size if size > 0 else 1)
     turned = np.abs(found.rotation - here.rotation).max()
-    error = max(missed, turned) / 16
-    if error > _VISIBLE:
-        warnings.warn(
-            "The rows of the run are too far apart to draw what is between them: it may be "
-            f"off by {100 * error:.0f} % of the size of the picture. Save more rows, or "
-            "the times of the picture: `saveat=ej.SaveAt(ts=...)`.",
-            stacklevel=2,
-        )
+    warn_if_visible(max(missed, turned) / 16)

@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from .._analysis import ConsistentStart, Equilibrium
-from .._programs import compiled, is_known
-from .._results import RESULTS, tally
-from .._run import Solution
+from .._programs import compiled
+from .._run import must_be_known, ReachedRows, Solution
 from .._system import State
 from ._frames import Numbers
 from ._interpolation import Frames, frames_at
@@ -96,25 +95,17 @@ def states_of(layout: Layout, sol: Any) -> Rows:
 
     **Raises:** `TypeError` or `ValueError` for what is no run of this scene.
     """
-    outcome = ""
-    if isinstance(sol, Solution):
-        ys, ts = sol.ys, sol.ts
-        if is_known(sol.result) and np.all(sol.result != RESULTS.successful):
-            outcome = tally(sol.result).removeprefix("1 ")
-    elif isinstance(sol, ConsistentStart | Equilibrium):
-        ys, ts = sol.state, 0.0
-    else:
-        ys, ts = sol, 0.0
+    of_run = isinstance(sol, Solution)
+    ys = sol.ys if of_run else sol
+    if isinstance(sol, ConsistentStart | Equilibrium):
+        ys = sol.state
     if not isinstance(ys, State):
         raise TypeError(
             "A scene shows the states of a run, a `Solution` whose `ys` are states, or a "
             f"`State`; got {type(ys).__name__}. Runs with `SaveAt(fn=...)` keep none."
         )
-    if not is_known((ys, ts)):
-        raise TypeError(
-            "Pictures need values: they cannot be made inside `jit`, `vmap` or `grad`."
-        )
-    q, v, ts = (np.asarray(x) for x in (ys.q, ys.v, ts))
+    must_be_known(ys)
+    q, v = np.asarray(ys.q), np.asarray(ys.v)
     wanted = (layout.num_coordinates,), (layout.num_velocities,)
     if (q.shape[-1:], v.shape[-1:]) != wanted:
         raise ValueError(
@@ -122,21 +113,21 @@ def states_of(layout: Layout, sol: Any) -> Rows:
             f"coordinates and {layout.num_velocities} velocities: its `q` has shape "
             f"{q.shape}, its `v` {v.shape}."
         )
-    if q.ndim == 1:
-        q, v, ts = q[None], v[None], np.atleast_1d(ts)
-    if q.ndim > 2 or ts.shape != q.shape[:1]:
+    if of_run:
+        rows = ReachedRows(sol)
+        return Rows(rows.ts, rows(q), rows(v), rows.outcome)
+    if q.ndim > 1:
         raise ValueError(
-            "A picture is of one run, but the coordinates of these states have the shape "
-            f"{q.shape}. Pick a run of a batch: `jax.tree.map(lambda x: x[3], sol)`."
+            f"A picture is of one state, but here are {q.shape[0]}: pass the run, and "
+            "`times` to see more than its last row, or pick one, "
+            "`jax.tree.map(lambda x: x[3], sol.ys)`."
         )
-    reached = np.isfinite(q).all(axis=1) & np.isfinite(v).all(axis=1) & np.isfinite(ts)
-    if not reached.any():
+    if not (np.isfinite(q).all() and np.isfinite(v).all()):
         raise ValueError(
-            "There is nothing to show: every entry is NaN, as after a step that failed"
-            f"{f' ({outcome})' if outcome else ''}. The last good state of a run is "
-            "`sol.end`."
+            "There is nothing to show: the state has NaN, as after a step that failed. The "
+            "last good state of a run is `sol.end`."
         )
-    return Rows(ts[reached], q[reached], v[reached], outcome)
+    return Rows(np.zeros(1), q[None], v[None], "")
 
 
 @compiled

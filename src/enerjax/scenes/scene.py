@@ -319,7 +319,9 @@ class Scene:
         - `ax`, `traces`, `units`: as for `draw`.
         - `energy`: whether the energies are plotted beside the scene.
 
-        **Returns:** an `enerjax.Animation`.
+        **Returns:** the film. `save(path)` writes a .gif, .mp4 (if the program ffmpeg is
+        found) or .html file; `show(k)` draws the frame of the time `ts[k]` into `figure`,
+        of matplotlib.
 
         **Raises:** as `draw`, and `ValueError` for a run that is too short or too long for
         a film at this speed.

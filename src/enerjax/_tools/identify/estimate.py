@@ -1,6 +1,7 @@
 """The estimate of a fit and its uncertainty."""
 
 import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -12,7 +13,7 @@ import scipy
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from ..._types import Count, Scalar
+from ..._types import Count, Scalar, Vector
 
 
 CONFIDENCE = 0.95
@@ -55,6 +56,55 @@ class Fit(eqx.Module):
     def noise(self) -> Scalar:
         """The standard deviation of the residuals."""
         return jnp.sqrt(self.cost / self.degrees_of_freedom)
+
+    def plot(
+        self,
+        predict: Callable[[Any], Any],
+        data: Vector,
+        ts: Vector | None = None,
+        *,
+        ax: Any = None,
+        units: dict[str, str] | None = None,
+    ) -> Any:
+        """The data, and the prediction with its 95 % interval.
+
+        The interval is that of the prediction by the uncertainty of the parameters, from
+        the linearisation at the estimate; it does not include the noise of the data.
+
+        **Arguments:**
+
+        - `predict`: a function of the parameters that returns what was measured, shape
+          `(times,)` or `(times, n)`.
+        - `data`: the measurements, of the same shape.
+        - `ts`: their times.
+        - `ax`: axes of matplotlib, by default new ones.
+        - `units`: names for the labels, such as `{"time": "s"}`.
+
+        **Returns:** the axes.
+
+        **Raises:** `ValueError` for shapes that differ.
+        """
+        from .plots import plot_prediction
+
+        return plot_prediction(self, predict, data, ts, ax, units)
+
+    def plot_intervals(
+        self,
+        truth: PyTree[Any] = None,
+        *,
+        names: Sequence[str] | None = None,
+        ax: Any = None,
+    ) -> Any:
+        """The 95 % intervals of the parameters, relative to their estimates, or to `truth`,
+        a pytree like the parameters. `names` chooses some of them.
+
+        **Returns:** the axes of matplotlib, which are `ax` or new ones.
+
+        **Raises:** `ValueError` for a name that is none, and a `truth` of other parameters.
+        """
+        from .plots import plot_intervals
+
+        return plot_intervals(self, truth, names, ax)
 
     def __str__(self) -> str:
         columns = (self.parameters, self.standard_errors, self.lower, self.upper)

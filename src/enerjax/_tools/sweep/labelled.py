@@ -87,6 +87,59 @@ class Sweep:
             part = part._taken(axis, int(place[axis]))
         return part
 
+    def results(self) -> dict[str, np.ndarray]:
+        """The numbers that the lanes returned, by the names in `print`."""
+        named = self._named()
+        return {name: np.asarray(x) for name, x in named if not isinstance(x, _Outcome)}
+
+    def plot_map(
+        self,
+        values: Any = None,
+        *,
+        x: str | None = None,
+        log: bool = False,
+        ax: Any = None,
+        units: dict[str, str] | None = None,
+    ) -> Any:
+        """A result over two parameters, as colours. Lanes that failed are crossed.
+
+        **Arguments:**
+
+        - `values`: a result, which is named as in `print`, or an array of your own with the
+          shape of the sweep; by default the only result.
+        - `x`: the parameter along the horizontal axis, by default the last.
+        - `log`: whether colours show the logarithm; values that have none are grey.
+        - `ax`: axes of matplotlib, by default new ones.
+        - `units`: of parameters and results, for the labels: `{"h": "s", "lost": "J"}`.
+
+        **Returns:** the axes.
+
+        **Raises:** `ValueError` if the sweep is not over two parameters (`at` chooses
+        values for others), for an unknown name, and for a result of several numbers a lane.
+        """
+        from .plots import plot_map
+
+        return plot_map(self, values, x, log, ax, units)
+
+    def plot_lines(
+        self,
+        values: Any = None,
+        *,
+        x: str | None = None,
+        log: bool = False,
+        ax: Any = None,
+        units: dict[str, str] | None = None,
+    ) -> Any:
+        """A result over one parameter as a line: one line for each value of a second
+        parameter, or for each entry of a result that is a vector.
+
+        `log` makes the vertical axis logarithmic. For the other arguments, the return value
+        and the errors see `plot_map`.
+        """
+        from .plots import plot_lines
+
+        return plot_lines(self, values, x, log, ax, units)
+
     def to_xarray(self) -> Any:
         """An `xarray.Dataset`: results with named axes, the parameters as coordinates.
 
