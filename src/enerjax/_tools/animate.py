@@ -5,7 +5,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 from typing_extensions import TypeAliasType
 
 from .._run import must_be_close, ReachedRows, Solution, warn_if_visible
@@ -93,9 +93,11 @@ def _at(ts: np.ndarray, places: np.ndarray, times: np.ndarray) -> np.ndarray:
     size = np.ptp(places.reshape(-1, places.shape[-1]), axis=0).max()
     if len(ts) > 3 and size > 0:
         # Through every other row; over twice the distance the error is 16 times as large.
-        rest = np.abs(CubicSpline(ts[::2], places[::2])(ts[1:-1:2]) - places[1:-1:2])
+        rest = np.abs(
+            scipy.interpolate.CubicSpline(ts[::2], places[::2])(ts[1:-1:2]) - places[1:-1:2]
+        )
         warn_if_visible(rest.max() / 16 / size)
-    return CubicSpline(ts, places)(times)
+    return scipy.interpolate.CubicSpline(ts, places)(times)
 
 
 class _Sketch:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
+import scipy
 
 from ._frames import GROUND, Numbers
 from ._laws import Alignment
@@ -145,8 +145,8 @@ def _linkage(points: np.ndarray) -> Shapes:
     if points.shape[1] == 3:
         return tuple(_rod(middle, x) for x in points if np.linalg.norm(x - middle) > 0)
     try:
-        corners = ConvexHull(points).vertices
-    except QhullError:  # almost on a line
+        corners = scipy.spatial.ConvexHull(points).vertices
+    except scipy.spatial.QhullError:  # almost on a line
         return (_rod(points[0], points[-1]),)
     fan = [(0, k, k + 1) for k in range(1, len(corners) - 1)]
     return (Mesh(points[corners], fan),)

@@ -8,7 +8,7 @@ The error is of fourth order in the distance of the rows.
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from .._run import must_be_close, warn_if_visible
 
@@ -117,12 +117,14 @@ def _rate_of_vector(vector: Array, spin: Array, h: Array) -> Array:
 
 
 def _logarithm(rotation: Array) -> Array:
-    flat = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()
+    flat = scipy.spatial.transform.Rotation.from_matrix(
+        rotation.reshape(-1, 3, 3)
+    ).as_rotvec()
     return flat.reshape(*rotation.shape[:-2], 3)
 
 
 def _exponential(vector: Array) -> Array:
-    flat = Rotation.from_rotvec(vector.reshape(-1, 3)).as_matrix()
+    flat = scipy.spatial.transform.Rotation.from_rotvec(vector.reshape(-1, 3)).as_matrix()
     return flat.reshape(*vector.shape[:-1], 3, 3)
 
 
