@@ -3,6 +3,7 @@
 import enum
 import hashlib
 import types
+import weakref
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -21,15 +22,21 @@ def checksum(arrays: Iterable[Any]) -> str:
     return word.hexdigest()
 
 
+# A program that is called again need not be read again.
+_known: weakref.WeakKeyDictionary[ClosedJaxpr, str] = weakref.WeakKeyDictionary()
+
+
 def digest(traced: ClosedJaxpr) -> str:
     """One word for a program, which is the same in every process.
 
     The text of the program does not suffice: it contains addresses of functions, but no
     values of constants.
     """
-    word = hashlib.sha256()
-    _read(traced.jaxpr, traced.consts, lambda *parts: word.update(repr(parts).encode()))
-    return word.hexdigest()
+    if traced not in _known:
+        word = hashlib.sha256()
+        _read(traced.jaxpr, traced.consts, lambda *x: word.update(repr(x).encode()))
+        _known[traced] = word.hexdigest()
+    return _known[traced]
 
 
 def _read(jaxpr: Jaxpr, consts: Any, tell: Callable) -> None:

@@ -43,13 +43,12 @@ class Group(eqx.Module):
     def after(self, attempt: Attempt) -> "Group":
         """The group with another attempted step."""
         newest = lambda new, old: jnp.where(attempt.accepted, new, old)
-        both = jax.tree.map(lambda *x: jnp.stack(x), self.costs, attempt.costs)
         return Group(
             begin=self.begin,
             accepted=self.accepted + attempt.accepted.astype(self.accepted.dtype),
             details=jax.tree.map(newest, attempt.details, self.details),
             energies=jax.tree.map(jnp.add, self.energies, attempt.energies),
-            costs=both.total(),
+            costs=self.costs.with_more(attempt.costs),
         )
 
     def empty(self, begin: Scalar) -> "Group":

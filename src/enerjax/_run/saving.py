@@ -111,6 +111,15 @@ class Costs(eqx.Module):
             local_error=jnp.sum(self.local_error, axis=0),
         )
 
+    def with_more(self, more: "Costs") -> "Costs":
+        """The costs of these steps and of more steps together."""
+        return Costs(
+            iterations=self.iterations + more.iterations,
+            residual=jnp.maximum(self.residual, more.residual),
+            halvings=jnp.maximum(self.halvings, more.halvings),
+            local_error=self.local_error + more.local_error,
+        )
+
     def by_segment(self, segment: Int[Array, " steps"], num_segments: int) -> "Costs":
         """The costs of the steps of each segment together."""
         add = lambda x: jax.ops.segment_sum(x, segment, num_segments)
