@@ -48,6 +48,9 @@ def public_names():
     for owner in (ej.bodies, ej.joints, ej.forces, ej.drives):
         # The modules of parts list only these.
         found |= {f"{owner.__name__}.{name}": getattr(owner, name) for name in dir(owner)}
+    for name, value in vars(ej.shapes).items():
+        if inspect.isclass(value) and issubclass(value, ej.shapes.AbstractShape):
+            found[f"{ej.shapes.__name__}.{name}"] = value
     return found
 
 

@@ -92,5 +92,5 @@ def test_the_table_of_subpackages_is_complete():
 @pytest.mark.slow
 def test_the_moving_picture_can_be_drawn(tmp_path):
     script = runpy.run_path(str(DOCS / "moving_picture.py"))
-    script["draw"](tmp_path / "picture.gif", frames=2)
+    script["draw"](tmp_path / "picture.gif", num_steps=5)
     assert (tmp_path / "picture.gif").read_bytes().startswith(b"GIF89a")

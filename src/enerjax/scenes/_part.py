@@ -54,7 +54,7 @@ def only_parts(names: dict[str, Any]) -> Callable[[], list[str]]:
             name
             for name, value in names.items()
             if inspect.isclass(value)
-            and issubclass(value, eqx.Module)
+            and "name" in getattr(value, "__dataclass_fields__", ())
             and not name.startswith("Abstract")
         )
 
