@@ -20,7 +20,12 @@ from .canvas import (
     Faces as Faces,
     Path as Path,
 )
-from .film import canvas_of as canvas_of, film as film, joint_bounds as joint_bounds
+from .film import (
+    canvas_of as canvas_of,
+    film as film,
+    joint_bounds as joint_bounds,
+    Trail as Trail,
+)
 from .geometry import (
     as_quadrilaterals as as_quadrilaterals,
     straight as straight,

@@ -18,7 +18,7 @@ from PIL import Image
 
 # More frames than this are a mistake: ten minutes of a film.
 _MOST_FRAMES = 15_000
-_COLORS = 128
+_COLORS = 256
 
 
 def frame_times(first: float, last: float, speed: float, fps: float) -> np.ndarray:
@@ -120,7 +120,9 @@ class Animation:
         count = len(self.ts)
         # The colours of a few frames, one above the other, are those of all.
         some = list(self._rendered((0, count // 2, count - 1), dpi))
-        palette = Image.fromarray(np.concatenate(some)).quantize(_COLORS)
+        # This method keeps the rare colours of small marks among many greys of letters.
+        by_coverage = Image.Quantize.MAXCOVERAGE
+        palette = Image.fromarray(np.concatenate(some)).quantize(_COLORS, by_coverage)
         # A mean of colours that are almost white is a grey page.
         levels = np.array(palette.getpalette())
         palette.putpalette(np.where(levels > 248, 255, levels).tolist())

@@ -14,6 +14,8 @@ from .canvas import AbstractCanvas, Drawing, PlaneCanvas, SpaceCanvas
 
 Array: TypeAlias = np.ndarray
 
+_TRAIL = 500  # points of a path: more take time, and show nothing more
+
 
 def joint_bounds(
     bounds: tuple[Array, Array], clouds: Sequence[Array]
@@ -22,6 +24,19 @@ def joint_bounds(
     lows = [bounds[0], *(x.min(axis=0) for x in clouds)]
     highs = [bounds[1], *(x.max(axis=0) for x in clouds)]
     return np.min(lows, axis=0), np.max(highs, axis=0)
+
+
+class Trail:
+    """The path of a point, shape `(n, d)`, at ascending times, of which some are kept."""
+
+    def __init__(self, ts: Array, points: Array):
+        chosen = np.linspace(0, len(ts) - 1, min(len(ts), _TRAIL)).astype(int)
+        self._ts, self.points = ts[chosen], points[chosen]
+
+    def until(self, t: float, here: Array) -> Array:
+        """The path up to a time, at which the point is `here`."""
+        count = np.searchsorted(self._ts, t)
+        return np.concatenate([self.points[:count], here[None]])
 
 
 def canvas_of(ax: Any, bounds: tuple[Array, Array], units: Units | None) -> AbstractCanvas:

@@ -97,18 +97,31 @@ def tube(path: np.ndarray, radius: float, sides: int = 6) -> np.ndarray:
     sizes = np.linalg.norm(sums, axis=1, keepdims=True)
     # Where a path turns back on itself, the ring belongs to the way there.
     bends = np.where(sizes > 1e-6, sums / np.where(sizes > 1e-6, sizes, 1), units[:-1])
-    first = across(units[0])[0]
-    rings, turn = [], 2 * np.pi * np.arange(sides) / sides
-    for middle, tangent in zip(path, [units[0], *bends, units[-1]], strict=True):
-        first = first - (first @ tangent) * tangent  # the direction before, made square
-        size = np.linalg.norm(first)
-        first = first / size if size > 1e-6 else across(tangent)[0]
-        second = np.cross(tangent, first)
-        circle = np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second
-        rings.append(middle + radius * circle)
-    low, high = np.array(rings[:-1]), np.array(rings[1:])
+    tangents = np.concatenate([units[:1], bends, units[-1:]])
+    first = _carried(across(units[0])[0], tangents)
+    second = np.cross(tangents, first)
+    turn = 2 * np.pi * np.arange(sides)[:, None] / sides
+    rings = np.cos(turn) * first[:, None] + np.sin(turn) * second[:, None]
+    rings = path[:, None] + radius * rings
+    low, high = rings[:-1], rings[1:]
     quads = [low, np.roll(low, -1, axis=1), np.roll(high, -1, axis=1), high]
     return np.stack(quads, axis=2).reshape(-1, 4, 3)
+
+
+def _carried(first: np.ndarray, tangents: np.ndarray) -> np.ndarray:
+    """A direction across a path, carried along it without twist, shape `(n, 3)`."""
+    a, b, c = first.tolist()  # plain numbers: a loop over small arrays is slow
+    found = []
+    for x, y, z in tangents.tolist():
+        along = a * x + b * y + c * z
+        a, b, c = a - along * x, b - along * y, c - along * z
+        size = (a * a + b * b + c * c) ** 0.5
+        if size < 1e-6:
+            a, b, c = across(np.array([x, y, z]))[0].tolist()
+            size = 1.0
+        a, b, c = a / size, b / size, c / size
+        found.append((a, b, c))
+    return np.array(found)
 
 
 def straight(start: np.ndarray, end: np.ndarray, longest: float) -> np.ndarray:

@@ -164,8 +164,7 @@ class SpaceSymbols:
 
     def trail(self, path: Array, color: Array) -> Drawing:
         """The path of a point."""
-        thinned = path[:: max(1, len(path) // 400)]
-        return Drawing((Faces(tube(thinned, 0.003 * self._size, 4), color),))
+        return Drawing((Faces(tube(path, 0.003 * self._size, 3), color),))
 
 
 def _closed(path: Array, radius: float) -> Array:

@@ -53,7 +53,7 @@ def animate(
     that do not exist, a batch of runs, a run with too few rows, and one that is too short
     or too long for a film at this speed.
     """
-    from .._pictures import film, frame_times
+    from .._pictures import film, frame_times, Trail
 
     rows = ReachedRows(sol)
     places = _places(points, jax.tree.map(rows, sol.ys))
@@ -64,14 +64,25 @@ def animate(
                 "from 0."
             )
     ts = frame_times(rows.ts[0], rows.ts[-1], speed, fps)
-    places = _at(rows.ts, places, ts)
-    cloud = places.reshape(-1, places.shape[-1])
-    bounds = cloud.min(axis=0), cloud.max(axis=0)
-    room = 0.05 * max(float(np.max(bounds[1] - bounds[0])), 1e-12)
+    shown = _at(rows.ts, places, ts)
+    # Paths are along the rows or the frames, of whichever there are more.
+    finer = (rows.ts, places) if len(rows.ts) > len(ts) else (ts, shown)
+    trails = {k: Trail(finer[0], finer[1][:, k]) for k in traces}
+    shown_too = [trail.points for trail in trails.values()]
+    cloud = np.concatenate([shown.reshape(-1, shown.shape[-1]), *shown_too])
+    low, high = cloud.min(axis=0), cloud.max(axis=0)
+    room = 0.05 * max(float(np.max(high - low)), 1e-12)
     return film(
-        _Sketch(places, lines, traces), (bounds[0] - room, bounds[1] + room), ts, ax, fps,
-        speed, units, outcome=rows.outcome, beside=sol.plot_energy if energy else None,
-    )  # fmt: skip
+        _Sketch(ts, shown, lines, trails),
+        (low - room, high + room),
+        ts,
+        ax,
+        fps,
+        speed,
+        units,
+        outcome=rows.outcome,
+        beside=sol.plot_energy if energy else None,
+    )
 
 
 def _places(points: Points, ys: Any) -> np.ndarray:
@@ -104,7 +115,11 @@ class _Sketch:
     """The drawing of each frame."""
 
     def __init__(
-        self, places: np.ndarray, lines: Sequence[Sequence[int]], traces: Sequence[int]
+        self,
+        ts: np.ndarray,
+        places: np.ndarray,
+        lines: Sequence[Sequence[int]],
+        trails: dict[int, Any],
     ):
         from .._pictures import color_of, Drawing, PlaneSymbols, SpaceSymbols
 
@@ -113,7 +128,7 @@ class _Sketch:
         )
         kind = PlaneSymbols if places.shape[-1] == 2 else SpaceSymbols
         self._symbols, self._nothing = kind(size if size > 0 else 1.0), Drawing()
-        self._places, self._lines, self._traces = places, lines, traces
+        self._ts, self._places, self._lines, self._trails = ts, places, lines, trails
         moving = [k for k in range(places.shape[1]) if np.ptp(places[:, k], axis=0).any()]
         self._colors = {k: color_of(f"C{n % 10}") for n, k in enumerate(moving)}
         self._fixed = color_of("0.4")
@@ -121,8 +136,8 @@ class _Sketch:
     def __call__(self, k: int) -> Any:
         drawing, here = self._nothing, self._places[k]
         color = lambda point: self._colors.get(point, self._fixed)
-        for point in self._traces:
-            path = self._places[: k + 1, point]
+        for point, trail in self._trails.items():
+            path = trail.until(self._ts[k], here[point])
             drawing += self._symbols.trail(path, color(point))
         for line in self._lines:
             drawing += self._symbols.bar(here[[*line]])

@@ -16,8 +16,10 @@ from .._pictures import (
     joint_bounds,
     label,
     tell,
+    Trail,
     Units,
 )
+from ._frames import GROUND
 from ._motion import Array, Motion
 from ._relative_motions import Reaction
 from ._sketch import Sketch
@@ -57,17 +59,16 @@ def traces_of(traces: Any, motion: Motion) -> list[Trace]:
     return found
 
 
-def _paths(motion: Motion, traces: list[Trace]) -> list[tuple[Array, Array]]:
-    """The path of each trace, shape `(times, d)`, and its colour."""
+def _trails(traces: list[Trace], motion: Motion) -> list[tuple[Trail, Trace, Array]]:
+    """The path of each trace along a motion, and its colour, that of the body."""
     bodies = {body.name: body for body in motion.bodies}
-    numbers = {name: k for k, name in enumerate(x for x in bodies if x != "ground")}
-    return [
-        (
-            bodies[name].position + bodies[name].rotation @ point,
-            color_of(f"C{numbers.get(name, 0) % 10}"),
-        )
-        for name, point in traces
-    ]
+    numbers = {name: k for k, name in enumerate(x for x in bodies if x != GROUND)}
+    found = []
+    for trace in traces:
+        body = bodies[trace.body]
+        path = Trail(motion.ts, body.position + body.rotation @ trace.point)
+        found.append((path, trace, color_of(f"C{numbers.get(trace.body, 0) % 10}")))
+    return found
 
 
 def draw(
@@ -83,13 +84,13 @@ def draw(
     `whole` is the motion along which traces are drawn.
     """
     sketch = Sketch(motion, whole)
-    paths = _paths(whole, traces_of(traces, motion))
-    bounds = joint_bounds(sketch.bounds(), [path for path, _ in paths])
+    trails = _trails(traces_of(traces, motion), whole)
+    bounds = joint_bounds(sketch.bounds(), [trail.points for trail, _, _ in trails])
     canvas = canvas_of(ax, bounds, units)
     count = len(motion.ts)
     drawing = Drawing()
-    for path, color in paths:
-        drawing += sketch.trail(path, color)
+    for trail, _, color in trails:
+        drawing += sketch.trail(trail.points, color)
     for k in range(count):
         drawing += sketch.at(k).faded(0.25 + 0.75 * (k + 1) / count)
     canvas.frame(*bounds)
@@ -104,7 +105,7 @@ def draw(
 def _write_names(canvas: AbstractCanvas, motion: Motion) -> None:
     """The names of bodies and of joints, moved apart."""
     texts = []
-    for k, body in enumerate(x for x in motion.bodies if x.name != "ground"):
+    for k, body in enumerate(x for x in motion.bodies if x.name != GROUND):
         texts.append(canvas.write(body.position[-1], body.name, color_of(f"C{k % 10}")))
     texts += [
         canvas.write((link.start[-1] + link.end[-1]) / 2, link.name, color_of("0.4"))
@@ -115,6 +116,7 @@ def _write_names(canvas: AbstractCanvas, motion: Motion) -> None:
 
 def animate(
     motion: Motion,
+    whole: Motion,
     sol: Any,
     ax: Any,
     fps: float,
@@ -125,15 +127,18 @@ def animate(
 ) -> Animation:
     """A film of a motion, one frame for each of its times."""
     sketch = Sketch(motion, motion)
-    paths = _paths(motion, traces_of(traces, motion))
+    # Along the rows or the frames, of whichever there are more.
+    finer = max(motion, whole, key=lambda x: len(x.ts))
+    trails = _trails(traces_of(traces, motion), finer)
 
     def at(k: int) -> Drawing:
-        drawing = Drawing()
-        for path, color in paths:
-            drawing += sketch.trail(path[: k + 1], color)
+        drawing, bodies = Drawing(), {body.name: body for body in motion.bodies}
+        for trail, (name, point), color in trails:
+            here = bodies[name].position[k] + bodies[name].rotation[k] @ point
+            drawing += sketch.trail(trail.until(motion.ts[k], here), color)
         return drawing + sketch.at(k)
 
-    bounds = joint_bounds(sketch.bounds(), [path for path, _ in paths])
+    bounds = joint_bounds(sketch.bounds(), [trail.points for trail, _, _ in trails])
     return film(
         at, bounds, motion.ts, ax, fps, speed, units,
         outcome=motion.outcome,

@@ -325,7 +325,7 @@ class Scene:
         whole = self.motion(sol, None, args)
         times = frame_times(whole.ts[0], whole.ts[-1], speed, fps)
         shown = self.motion(sol, times, args)
-        return animate(shown, sol, ax, fps, speed, traces, energy, units)
+        return animate(shown, whole, sol, ax, fps, speed, traces, energy, units)
 
     def plot_reactions(
         self,
