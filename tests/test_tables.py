@@ -201,6 +201,6 @@ def test_wrong_names_are_refused():
         (ej.Names(constraints=[]), ValueError, "has 0 constraints, and the system has 1"),
         (["x", "y"], TypeError, "`names` must be"),
     ):
-        named = ej.System(system.kinetic, system.potential, system.constraint, names=names)
+        named = ej.System(system.kinetic, system.potential, system.constraint, names=names)  # pyright: ignore
         with pytest.raises(kind, match=message):
             ej.initial_state(named, start.q, start.v, args)

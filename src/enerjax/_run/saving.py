@@ -224,9 +224,9 @@ class AbstractSaving(eqx.Module):
     def is_due(self, plan: AbstractPlan, standing: Standing) -> Flag:
         """Whether the open group must end here, in a run whose groups have any length."""
 
+    @abc.abstractmethod
     def of_groups(self) -> "AbstractSaving":
         """The saving that makes the same rows of groups that ended where they were due."""
-        return self
 
 
 def saving_of(
@@ -262,6 +262,9 @@ class _AtBothEnds(AbstractSaving):
     def is_due(self, plan: AbstractPlan, standing: Standing) -> Flag:
         return jnp.array(False)
 
+    def of_groups(self) -> "_AtBothEnds":
+        return self
+
 
 class _EveryEqualStep(AbstractSaving):
     """The start, every `every`-th of the equal steps, and the end."""
@@ -285,6 +288,9 @@ class _EveryEqualStep(AbstractSaving):
 
     def is_due(self, plan: AbstractPlan, standing: Standing) -> Flag:
         return standing.completed % self.every == 0
+
+    def of_groups(self) -> "_EveryEqualStep":
+        return self
 
 
 class _EveryAcceptedStep(AbstractSaving):
@@ -377,6 +383,9 @@ class _AtTimes(AbstractSaving):
         room = standing.next - standing.place
         first = jnp.searchsorted(places, standing.begin - room)
         return first < jnp.searchsorted(places, standing.next + room, side="right")
+
+    def of_groups(self) -> "_AtTimes":
+        return self
 
 
 def _states_within(
