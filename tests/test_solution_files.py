@@ -87,8 +87,7 @@ def test_names_and_batches_are_restored(tmp_path):
 
     batch = jax.vmap(of)(jnp.array([9.81, jnp.nan]))
     found = assert_restored(tmp_path / "a.npz", batch)
-    assert found.names.coordinates == ("x", "y")  # pyright: ignore
-    assert found.names.velocities is None  # pyright: ignore
+    assert found.names == names
     np.testing.assert_array_equal(
         found.result == ej.RESULTS.successful, np.array([True, False])
     )

@@ -1,4 +1,4 @@
-"""The rows that a run reached, as pictures need them."""
+"""The rows that a run reached, as pictures and tables need them."""
 
 import warnings
 from typing import Any
@@ -33,7 +33,7 @@ class ReachedRows:
         energy, ts = np.asarray(sol.audit.energy), np.asarray(sol.ts)
         if energy.ndim != 1:
             raise ValueError(
-                f"A picture is of one run, but this is a batch of {energy.shape[:-1]}: "
+                f"One run is needed, but this is a batch of {energy.shape[:-1]}: "
                 "pick one, `jax.tree.map(lambda x: x[3], sol)`."
             )
         words = tally(sol.result).removeprefix("1 ")
@@ -60,7 +60,8 @@ def must_be_known(values: Any) -> None:
     """Raises an error for traced values."""
     if not is_known(values):
         raise TypeError(
-            "Pictures need values: they cannot be made inside `jit`, `vmap` or `grad`."
+            "Pictures and tables need values: they cannot be made inside `jit`, `vmap` or "
+            "`grad`."
         )
 
 

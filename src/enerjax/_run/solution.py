@@ -13,7 +13,6 @@ from .._results import RESULTS, tally
 from .._system import Names, State
 from .._types import Count, Scalar
 from .audit import Audit
-from .tables import data_frame, dataset, table, write_csv
 
 
 class Statistics(eqx.Module):
@@ -129,8 +128,11 @@ class Solution(eqx.Module):
         - `path`: the name of the file.
         - `columns`: see `to_pandas`.
 
-        **Raises:** `ValueError` for a batch of runs, and for columns of another length.
+        **Raises:** `ValueError` for a batch of runs, a run without rows, and columns of
+        another length.
         """
+        from .tables import table, write_csv
+
         write_csv(path, table(self, columns))
 
     def to_pandas(self, columns: Mapping[str, ArrayLike] | None = None) -> Any:
@@ -150,11 +152,13 @@ class Solution(eqx.Module):
         **Raises:** `ImportError` without pandas (the extra `tables`); `ValueError` for a
         batch of runs, and for columns of another length.
         """
+        from .tables import data_frame, table
+
         return data_frame(table(self, columns))
 
     def to_xarray(self) -> Any:
         """An `xarray.Dataset` with the dimensions `t`, `coordinate`, `velocity`,
-        `constraint` and `symmetry`, and names as their coordinates.
+        `multiplier`, `joint` and `symmetry`, and names as their coordinates.
 
         Its variables are `q`, `v`, `multipliers`, the entries of the audit, `details` and
         the statistics. The outcome of the run is among its `attrs`. Rows that the run has
@@ -163,6 +167,8 @@ class Solution(eqx.Module):
         **Raises:** `ImportError` without xarray (the extra `tables`); `ValueError` for a
         batch of runs.
         """
+        from .tables import dataset
+
         return dataset(self)
 
     def plot(self, axes: Any = None, *, units: dict[str, str] | None = None) -> Any:

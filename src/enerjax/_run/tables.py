@@ -15,15 +15,17 @@ from jaxtyping import ArrayLike
 from .._files import write_whole
 from .._results import names_of
 from .._system import Names, State
+from .reached import ReachedRows
+from .solution import Solution
 
 
 # Arrays by name, with the rows along the first axis.
 Columns: TypeAlias = dict[str, np.ndarray]
 
 
-def table(solution: Any, columns: Mapping[str, ArrayLike] | None) -> Columns:
+def table(solution: Solution, columns: Mapping[str, ArrayLike] | None) -> Columns:
     """One array `(rows,)` for each column of a table of the reached rows."""
-    reached, labels = _reached(solution), _labels(solution)
+    reached, labels = ReachedRows(solution), _labels(solution)
     found = dict(t=np.asarray(solution.ts))
     if columns is None:
         found |= _of_states(solution) | dict(multiplier=np.asarray(solution.multipliers))
@@ -31,27 +33,16 @@ def table(solution: Any, columns: Mapping[str, ArrayLike] | None) -> Columns:
         found |= {name: np.asarray(x) for name, x in columns.items()}
     found |= _of_audit(solution) | _of_steps(solution)
     for name, x in found.items():
-        if x.shape[:1] != reached.shape:
+        if x.shape[:1] != solution.ts.shape:
             raise ValueError(
                 f"The column `{name}` has the shape {x.shape}, and the run has "
-                f"{reached.size} rows: the first axis must be that of the rows."
+                f"{solution.ts.size} rows: the first axis must be that of the rows."
             )
     flat = _flat(found, labels | dict(multiplier=labels["constraint"]))
-    return {name: x[reached] for name, x in flat}
+    return {name: reached(x) for name, x in flat}
 
 
-def _reached(solution: Any) -> np.ndarray:
-    """Which rows the run has reached."""
-    if np.ndim(solution.ts) != 1:
-        raise ValueError(
-            "Tables are made of one run, and this is a batch of shape "
-            f"{np.shape(solution.ts)[:-1]}: take one lane, such as "
-            "`jax.tree.map(lambda x: x[0], solution)`."
-        )
-    return np.isfinite(np.asarray(solution.ts + solution.audit.kinetic))
-
-
-def _labels(solution: Any) -> dict[str, list[str]]:
+def _labels(solution: Solution) -> dict[str, list[str]]:
     """The names along the second axis of arrays."""
     names, audit = solution.names or Names(), solution.audit
     number = lambda kind, x: [f"{kind}{k}" for k in range(x.shape[-1])]
@@ -67,20 +58,20 @@ def _labels(solution: Any) -> dict[str, list[str]]:
     return found
 
 
-def _of_states(solution: Any) -> Columns:
+def _of_states(solution: Solution) -> Columns:
     if isinstance(solution.ys, State):
         return dict(q=np.asarray(solution.ys.q), v=np.asarray(solution.ys.v))
     return _named(solution.ys, "y")
 
 
-def _of_audit(solution: Any) -> Columns:
+def _of_audit(solution: Solution) -> Columns:
     """The entries of the audit, with those that follow from others."""
     audit = solution.audit
     names = [field.name for field in dataclasses.fields(audit)]
     return {name: np.asarray(getattr(audit, name)) for name in [*names, "energy", "leak"]}
 
 
-def _of_steps(solution: Any) -> Columns:
+def _of_steps(solution: Solution) -> Columns:
     """What belongs to the steps before a row. There are none before the start."""
     stats = solution.stats
     names = ("newton_iterations", "residual", "halvings", "local_error")
@@ -137,12 +128,12 @@ def data_frame(columns: Columns) -> Any:
     return pandas.DataFrame(rest, index=index)
 
 
-def dataset(solution: Any) -> Any:
+def dataset(solution: Solution) -> Any:
     try:
         import xarray  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise _missing("to_xarray", "xarray") from error
-    reached, labels = _reached(solution), _labels(solution)
+    reached, labels = ReachedRows(solution), _labels(solution)
     dims = dict(
         q="coordinate",
         v="velocity",
@@ -157,7 +148,7 @@ def dataset(solution: Any) -> Any:
     for name, x in values.items():
         known = [dims[name]] if name in dims else []
         own = [f"{name}_{k}" for k in range(x.ndim - 1 - len(known))]
-        variables[name] = (["t", *known, *own], x[reached])
+        variables[name] = (["t", *known, *own], reached(x))
     coordinates = {dims[name]: np.array(names, str) for name, names in labels.items()}
     stats = solution.stats
     about = dict(
@@ -167,7 +158,7 @@ def dataset(solution: Any) -> Any:
     )
     if stats.rejected_steps is not None:
         about["rejected_steps"] = int(stats.rejected_steps)
-    coordinates["t"] = np.asarray(solution.ts)[reached]
+    coordinates["t"] = reached.ts
     return xarray.Dataset(variables, coordinates, about)
 
 
