@@ -18,7 +18,8 @@ from PIL import Image
 
 # More frames than this are a mistake: ten minutes of a film.
 _MOST_FRAMES = 15_000
-_COLORS = 256
+# Of the 256 colours of a file, so many are exact.
+_EXACT = 160
 
 
 def frame_times(first: float, last: float, speed: float, fps: float) -> np.ndarray:
@@ -118,14 +119,7 @@ class Animation:
     def _frames(self, dpi: float) -> list[Image.Image]:
         """All frames, with a palette that they share."""
         count = len(self.ts)
-        # The colours of a few frames, one above the other, are those of all.
-        some = list(self._rendered((0, count // 2, count - 1), dpi))
-        # This method keeps the rare colours of small marks among many greys of letters.
-        by_coverage = Image.Quantize.MAXCOVERAGE
-        palette = Image.fromarray(np.concatenate(some)).quantize(_COLORS, by_coverage)
-        # A mean of colours that are almost white is a grey page.
-        levels = np.array(palette.getpalette())
-        palette.putpalette(np.where(levels > 248, 255, levels).tolist())
+        palette = _palette(list(self._rendered((0, count // 2, count - 1), dpi)))
         return [
             Image.fromarray(x).quantize(palette=palette, dither=Image.Dither.NONE)
             for x in self._rendered(range(count), dpi)
@@ -193,6 +187,26 @@ class Animation:
             frames=",".join(f'"{x}"' for x in sources),
             milliseconds=1000 / self.fps,
         )
+
+
+def _palette(pictures: list[np.ndarray]) -> Image.Image:
+    """A palette of the most frequent colours of some pictures, which are those of areas,
+    and of means of the others, which are those of blurred edges."""
+    pixels = np.concatenate([x.reshape(-1, 3) for x in pictures]).astype(int)
+    weights = np.array([1 << 16, 1 << 8, 1])
+    codes, counts = np.unique((pixels * weights).sum(axis=1), return_counts=True)
+    codes = codes[np.argsort(-counts, kind="stable")]
+    # Pillow does not tell colours in a cell of eight levels apart: the first counts.
+    codes = codes[np.sort(np.unique(codes & 0xF8F8F8, return_index=True)[1])]
+    colors = np.stack([codes >> 16, codes >> 8 & 255, codes & 255], axis=1).astype(np.uint8)
+    exact, others = colors[:_EXACT], colors[_EXACT:]
+    table = exact.ravel().tolist()
+    if len(others):
+        means = Image.fromarray(others[None]).quantize(256 - _EXACT).getpalette() or []
+        table += means[: 3 * (256 - _EXACT)]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(table)
+    return palette
 
 
 _PLAYER = """<div id="{name}">

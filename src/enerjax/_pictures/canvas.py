@@ -1,6 +1,7 @@
 """What a picture shows at one time, and the artists of matplotlib that show it."""
 
 import abc
+from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
 import matplotlib.patheffects as effects
@@ -63,11 +64,10 @@ class Drawing(NamedTuple):
     paths: tuple[Path, ...] = ()
     dots: tuple[Dot, ...] = ()
 
-    def faded(self, opacity: float) -> "Drawing":
-        """The same with another opacity, relative to its own."""
-        factor = np.array([1.0, 1.0, 1.0, opacity])
-        paler = lambda parts: tuple(x._replace(color=x.color * factor) for x in parts)
-        return Drawing(paler(self.faces), paler(self.paths), paler(self.dots))
+    def recolored(self, change: Callable[[Array], Array]) -> "Drawing":
+        """The same in other colours."""
+        of = lambda parts: tuple(x._replace(color=change(x.color)) for x in parts)
+        return Drawing(of(self.faces), of(self.paths), of(self.dots))
 
     def __add__(self, other: Any) -> "Drawing":
         """Both, the other in front."""
@@ -91,6 +91,10 @@ class AbstractCanvas(abc.ABC):
 
     @abc.abstractmethod
     def show(self, drawing: Drawing) -> None: ...
+
+    @abc.abstractmethod
+    def pale(self, color: Array, strength: float) -> Array:
+        """A paler colour; that of strength 1 is the colour itself."""
 
     @abc.abstractmethod
     def frame(self, low: Array, high: Array) -> None:
@@ -162,6 +166,9 @@ class PlaneCanvas(AbstractCanvas):
             linewidths=1.0,
         )
 
+    def pale(self, color: Array, strength: float) -> Array:
+        return color * np.array([1, 1, 1, strength])
+
     def frame(self, low: Array, high: Array) -> None:
         room = 0.05 * np.max(high - low)
         self.ax.update_datalim([low - room, high + room])
@@ -207,8 +214,13 @@ class SpaceCanvas(AbstractCanvas):
             colors.append(shaded)
         shaded = np.concatenate(colors)
         self._faces.set_verts(np.concatenate(quads))
-        # Edges in the colour of their face close the seams between faces.
-        self._faces.set(facecolor=shaded, edgecolor=shaded, linewidth=0.3)
+        # Edges in the colour of their face close the seams between opaque faces.
+        edges = np.where(shaded[:, 3:] < 1, 0.0, shaded)
+        self._faces.set(facecolor=shaded, edgecolor=edges, linewidth=0.3)
+
+    def pale(self, color: Array, strength: float) -> Array:
+        # With less opacity the inside of bodies would be seen.
+        return np.append(1 - strength * (1 - color[:3]), color[3])
 
     def frame(self, low: Array, high: Array) -> None:
         ax: Any = self.ax

@@ -74,6 +74,7 @@ def _figsize(low: Array, high: Array) -> tuple[float, float]:
 def _spatial_axes(figure: Any, place: Any) -> Any:
     ax = figure.add_subplot(place, projection="3d")
     ax.view_init(elev=22, azim=-55)
+    ax.locator_params(nbins=5)
     return ax
 
 

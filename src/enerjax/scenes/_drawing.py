@@ -1,5 +1,6 @@
 """Pictures and films of scenes, and plots of their reactions."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -92,7 +93,8 @@ def draw(
     for trail, _, color in trails:
         drawing += sketch.trail(trail.points, color)
     for k in range(count):
-        drawing += sketch.at(k).faded(0.25 + 0.75 * (k + 1) / count)
+        pale = partial(canvas.pale, strength=0.25 + 0.75 * (k + 1) / count)
+        drawing += sketch.at(k).recolored(pale)
     canvas.frame(*bounds)
     canvas.show(drawing)
     if names:

@@ -24,7 +24,7 @@ from ._rotations import rotation_matrix
 # A name that matplotlib knows, "#rrggbb", or three or four numbers from 0 to 1.
 Color = TypeAliasType("Color", str | Sequence[float])
 
-_SIDES = 20  # of the polygons that stand for circles
+_SIDES = 24  # of the polygons that stand for circles
 
 
 class Facets(NamedTuple):
