@@ -11,6 +11,7 @@ from ._body_coordinates import quaternion_rates as quaternion_rates, rotation as
 from ._ends import Ends as Ends
 from ._frames import Frame as Frame
 from ._gaps import Gap as Gap
+from ._importing import from_mjcf as from_mjcf, from_urdf as from_urdf
 from ._laws import (
     AbstractConstraintLaw as AbstractConstraintLaw,
     AbstractForceLaw as AbstractForceLaw,
@@ -19,6 +20,7 @@ from ._laws import (
 )
 from ._measures import (
     AbstractMeasure as AbstractMeasure,
+    AbstractTurn as AbstractTurn,
     Place as Place,
     PlanarTurn as PlanarTurn,
     Separation as Separation,

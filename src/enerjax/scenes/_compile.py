@@ -13,20 +13,28 @@ from .._types import Coordinates
 from ._arguments import module_of, number
 from ._ends import Ends, Hinge, Hinges
 from ._frames import Frame, GROUND, Numbers
+from ._inerters import AbstractInerter
 from ._law_checks import resolved_part
+from ._laws import Flywheel
 from ._layout import Layout, Link, numbers_of
 from ._parameters import Parameters
-from ._pose_view import View
+from ._pose_view import evaluate, View
 from .bodies import AbstractBody
 from .drives import AbstractDrive
 from .forces import AbstractForce, Potential
 from .joints import AbstractJoint, Constraint
 
 
+# The kinds of parts that connect two bodies. Joints are first: others ask which axes they
+# keep.
+LINKS = (AbstractJoint, AbstractForce, AbstractDrive, AbstractInerter)
+
+
 def sort_parts(parts: Sequence[Any]) -> dict[type, list[Any]]:
     """The parts by their class, after checks of their names and dimensions."""
     kinds = (
-        AbstractBody, AbstractJoint, AbstractForce, AbstractDrive, Constraint, Potential,
+        AbstractBody, AbstractJoint, AbstractForce, AbstractDrive, AbstractInerter,
+        Constraint, Potential,
     )  # fmt: skip
     found: dict[type, list[Any]] = {kind: [] for kind in kinds}
     if isinstance(parts, kinds):
@@ -76,7 +84,7 @@ def compile_parts(
     rows = numbers_of(named)
     ends = _StartPose(bodies, rows)
     resolved = {}
-    for kind in (AbstractJoint, AbstractForce, AbstractDrive):
+    for kind in LINKS:
         resolved[kind] = [(part, *resolved_part(part, ends(part))) for part in found[kind]]
         ends.hinges = _hinges(ends, resolved[AbstractJoint])
     links = {
@@ -94,12 +102,17 @@ def compile_parts(
         potentials=tuple((part.name, part.function) for part in found[Potential]),
         has_gravity=gravity is not None,
         drives=links[AbstractDrive],
+        inerters=links[AbstractInerter],
     )
     tables = dict(
         bodies=_tables(layout.body_groups, {b.name: b.numbers for b in bodies}),
         joints=_tables(layout.joint_groups, _by_name(resolved[AbstractJoint])),
         forces=_tables(layout.force_groups, _by_name(resolved[AbstractForce])),
         drives=_tables(layout.drive_groups, _by_name(resolved[AbstractDrive])),
+        inerters=_tables(
+            [group.links for group in layout.inerter_groups],
+            _by_name(resolved[AbstractInerter]),
+        ),
     )
     return layout, Parameters(tables, _own(own, gravity, layout, tables), layout)
 
@@ -193,6 +206,30 @@ class _StartPose:
 def _all_frames(layout: Layout, q: Coordinates) -> Frame:
     view = View(layout, q)
     return Frame(view.origins, view.axes, view.angles)
+
+
+def start_of(
+    layout: Layout, args: Parameters, bodies: Sequence[AbstractBody]
+) -> tuple[Array, Array]:
+    """The coordinates and velocities of the start; those of inerters come last."""
+    q, v = (join([getattr(body, x) for body in bodies]) for x in ("q", "v"))
+    if not layout.inerters:
+        return q, v
+    own = _values_of_inerters(layout, q, args)
+    return jnp.concatenate([q, own]), jnp.concatenate([v, jnp.zeros_like(own)])
+
+
+@compiled
+def _values_of_inerters(layout: Layout, q: Coordinates, args: Parameters) -> Array:
+    """The lengths and angles of all inerters, in the order of their coordinates."""
+    view, first = View(layout, q), q.size
+    own = jnp.zeros((len(layout.inerters),), q.dtype)
+    groups = zip(layout.inerter_groups, args.tables["inerters"], strict=True)
+    for group, numbers in groups:
+        assert isinstance(group.links.law, Flywheel)
+        measured = group.links._replace(law=group.links.law.measure)
+        own = own.at[group.q - first].set(evaluate(measured, view, numbers))
+    return own
 
 
 def join(parts: Sequence[Any]) -> Array:

@@ -6,7 +6,14 @@ import numpy as np
 from jaxtyping import Array
 
 from .._types import Coordinates, Real
-from ._functions import constraint, driven, drives_at, internal, redundancy
+from ._functions import (
+    constraint,
+    driven,
+    drives_at,
+    inerters_at,
+    internal,
+    redundancy,
+)
 from ._layout import Layout
 from ._parameters import Parameters
 from ._pose_view import evaluate, View
@@ -14,21 +21,25 @@ from ._user_functions import vector_of
 
 
 def members(layout: Layout) -> list[tuple[str, ...]]:
-    """The names of all joints, constraints and drives, in the order of their rows."""
+    """The names of all joints, constraints, inerters and drives, in the order of their
+    rows."""
     joined = [group.names for group in layout.joint_groups]
     joined += [(name,) for name, _ in layout.constraints]
+    joined += [group.links.names for group in layout.inerter_groups]
     return joined + [group.names for group in layout.drive_groups]
 
 
 def rows_of(layout: Layout, q: Coordinates, args: Parameters) -> dict[str, slice]:
-    """The rows of each part. Internal rows of bodies are between joints and drives."""
+    """The rows of each part. Internal rows of bodies are before those of drives."""
 
     def of_joints(q: Coordinates) -> list[Array]:
         view = View(layout, q)
         groups = zip(layout.joint_groups, args.tables["joints"], strict=True)
         found = [evaluate(group, view, numbers) for group, numbers in groups]
         own = [vector_of(name, fn, view, args) for name, fn in layout.constraints]
-        return found + [rows[None] for rows in own]
+        found += [rows[None] for rows in own]
+        pairs = inerters_at(layout, q, args)
+        return found + [evaluate(group, view, numbers) for group, numbers in pairs]
 
     def of_drives(q: Coordinates) -> list[Array]:
         view = View(layout, q)

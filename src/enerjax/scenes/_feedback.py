@@ -8,7 +8,13 @@ from jaxtyping import Array
 
 from .._types import Coordinates, Scalar, Vector, Velocities
 from ._frames import Numbers, Point
-from ._laws import AbstractConstraintLaw, AbstractForceLaw, AbstractSpringLaw, Driven
+from ._laws import (
+    AbstractConstraintLaw,
+    AbstractForceLaw,
+    AbstractSpringLaw,
+    Driven,
+    Flywheel,
+)
 from ._layout import Layout, Links
 from ._measures import AbstractMeasure
 from ._parameters import Parameters
@@ -89,19 +95,22 @@ def measure_of(layout: Layout, name: str) -> AbstractMeasure:
 def measures_of(layout: Layout) -> dict[str, AbstractMeasure]:
     """The measures of all parts that have one."""
     found = {}
-    for link in (*layout.joints, *layout.forces, *layout.drives):
+    for link in (*layout.joints, *layout.forces, *layout.drives, *layout.inerters):
         if isinstance(link.law, _MEASURED) and link.law.measure is not None:
             found[link.name] = link.law.measure
     return found
 
 
-_MEASURED = AbstractConstraintLaw | AbstractSpringLaw | AbstractForceLaw | Driven
+_MEASURED = AbstractConstraintLaw | AbstractSpringLaw | AbstractForceLaw | Driven | Flywheel
 
 
 def link_of(layout: Layout, name: str, args: Parameters) -> tuple[Links, Numbers]:
-    """One joint, force or drive, and its numbers as tables with one row."""
+    """One joint, force, drive or inerter, and its numbers as tables with one row."""
     groups = dict(
-        joints=layout.joint_groups, forces=layout.force_groups, drives=layout.drive_groups
+        joints=layout.joint_groups,
+        forces=layout.force_groups,
+        drives=layout.drive_groups,
+        inerters=[group.links for group in layout.inerter_groups],
     )
     section = next(key for key in groups if name in layout.places[key])
     number, row = layout.places[section][name]

@@ -40,6 +40,9 @@ def kinetic(layout: Layout, v: Velocities, args: Parameters) -> Scalar:
         jnp.sum(jax.vmap(group.kind.kinetic)(rows(v, group.v), numbers))
         for group, numbers in zip(layout.body_groups, args.tables["bodies"], strict=True)
     ]
+    groups = zip(layout.inerter_groups, args.tables["inerters"], strict=True)
+    for group, numbers in groups:
+        energies.append(0.5 * jnp.sum(numbers["inertance"] * rows(v, group.v) ** 2))
     return sum(energies[1:], start=energies[0])
 
 
@@ -74,7 +77,21 @@ def constraint(layout: Layout, q: Coordinates, args: Parameters) -> Multipliers:
         for group, numbers in zip(layout.joint_groups, args.tables["joints"], strict=True)
     ]
     parts += [vector_of(name, fn, view, args) for name, fn in layout.constraints]
+    parts += [
+        evaluate(group, view, numbers).reshape(-1)
+        for group, numbers in inerters_at(layout, q, args)
+    ]
     return jnp.concatenate(parts)
+
+
+def inerters_at(
+    layout: Layout, q: Coordinates, args: Parameters
+) -> list[tuple[Links, dict[str, Array]]]:
+    """All inerters, with numbers that include the value of their coordinate."""
+    groups = zip(layout.inerter_groups, args.tables["inerters"], strict=True)
+    return [
+        (group.links, numbers | dict(value=rows(q, group.q))) for group, numbers in groups
+    ]
 
 
 def internal(layout: Layout, q: Coordinates) -> Multipliers:
@@ -155,7 +172,7 @@ def pushes(group: Links, numbers: dict[str, Array], view: View, rate: Array) -> 
 def velocity_map(layout: Layout, q: Coordinates, args: Parameters) -> Float[Array, "nv nq"]:
     matrix = np.zeros((layout.num_velocities, layout.num_coordinates))
     plain = [group for group in layout.body_groups if not group.kind.num_redundant]
-    for group in plain:
+    for group in (*plain, *layout.inerter_groups):
         matrix[group.v, group.q] = 1
     full = jnp.asarray(matrix, q.dtype)
     for group in layout.body_groups:

@@ -10,8 +10,8 @@ from .._programs import compiled
 from .._types import Coordinates, Scalar
 from ._constraint_rows import members
 from ._frames import Frame, Numbers
-from ._functions import drives_at
-from ._laws import Driven, Length, Missed
+from ._functions import drives_at, inerters_at
+from ._laws import Driven, Flywheel, Length, Missed
 from ._layout import Layout, Links
 from ._measures import Separation, Slide
 from ._parameters import Parameters
@@ -47,10 +47,14 @@ Columns: TypeAlias = tuple[Array, Array, Array, Array]
 def measured(
     layout: Layout, q: Coordinates, qdot: Coordinates, t: Scalar, args: Parameters
 ) -> list[Columns]:
-    """The gaps of every group of joints, then of the user's constraints, then of drives."""
+    """The gaps of every group of joints, then of the user's constraints, then of inerters,
+    then of drives."""
+
+    def kept(x: Coordinates, t: Scalar) -> list[tuple[Links, dict[str, Array]]]:
+        return [*inerters_at(layout, x, args), *drives_at(layout, t, args)]
+
     joints = list(zip(layout.joint_groups, args.tables["joints"], strict=True))
-    drives = drives_at(layout, t, args)
-    bodies = _Bodies(layout, q, qdot, args, [*joints, *drives])
+    bodies = _Bodies(layout, q, qdot, args, [*joints, *kept(q, t)])
     found = []
     for group, numbers in joints:
         rows = lambda x, group=group, numbers=numbers: evaluate(
@@ -66,12 +70,12 @@ def measured(
         slope = _never_zero(jnp.linalg.norm(jax.jacfwd(of_q)(q), axis=1))
         value, rate = (jnp.linalg.norm(x / slope)[None] for x in pair)
         found.append((value, rate, bodies.extent[None], jnp.full((1,), jnp.inf)))
-    for k, (group, numbers) in enumerate(drives):
-        assert isinstance(group.law, Driven)
+    for k, (group, numbers) in enumerate(kept(q, t)):
+        assert isinstance(group.law, Driven | Flywheel)
         missed = group._replace(law=Missed(group.law.measure))
 
         def rows_at(x: Coordinates, t: Scalar, k: int = k, missed: Links = missed) -> Array:
-            return evaluate(missed, View(layout, x), drives_at(layout, t, args)[k][1])
+            return evaluate(missed, View(layout, x), kept(x, t)[k][1])
 
         pair = jax.jvp(rows_at, (q, t), (qdot, jnp.ones_like(t)))
         found.append(bodies.compared(missed, numbers, pair))
@@ -79,7 +83,7 @@ def measured(
 
 
 def by_name(layout: Layout, found: list[Columns]) -> dict[str, Measured]:
-    """The gap of each joint, constraint and drive, as numbers."""
+    """The gap of each joint, constraint, inerter and drive, as numbers."""
     found = jax.device_get(found)
     return {
         name: Measured(*(float(x[row]) for x in gaps))
@@ -158,7 +162,8 @@ def _arms(group: Links, numbers: Numbers, q: Coordinates) -> Float[Array, " join
             arms = jnp.maximum(arms, jnp.where(jnp.asarray(side > 0), arm, 0))
     if isinstance(group.law, Length):
         arms = jnp.maximum(arms, jnp.abs(numbers["length"]))
-    if isinstance(group.law, Driven) and isinstance(group.law.measure, Separation | Slide):
+    lengths = Separation | Slide
+    if isinstance(group.law, Driven | Flywheel) and isinstance(group.law.measure, lengths):
         arms = jnp.maximum(arms, jnp.abs(numbers["value"]))
     return arms
 

@@ -12,6 +12,7 @@ from ._arguments import module_of
 from ._ends import Ends
 from ._frames import Numbers
 from ._functions import pushes
+from ._inerters import AbstractInerter
 from ._laws import (
     AbstractConstraintLaw,
     AbstractForceLaw,
@@ -19,6 +20,7 @@ from ._laws import (
     AbstractSpringLaw,
     Acting,
     Driven,
+    Flywheel,
 )
 from ._layout import Layout, Links
 from ._measures import AbstractLaw
@@ -43,6 +45,8 @@ def resolved_part(part: Any, ends: Ends) -> tuple[AbstractLaw, Numbers]:
     elif isinstance(part, AbstractForce):
         kinds = _OF_FORCES
         names = "an `AbstractPotentialLaw`, `AbstractSpringLaw` or `AbstractForceLaw`"
+    elif isinstance(part, AbstractInerter):
+        kinds, names = Flywheel, "a `Flywheel` law"
     if not isinstance(law, kinds):
         raise TypeError(f"{told} {names} and its numbers, got {law!r}.")
     try:

@@ -19,6 +19,10 @@ from ._frames import Frame, Numbers, Point
 from ._measures import AbstractLaw, AbstractMeasure, offset, Separation
 
 
+# Pairs of axes that stay perpendicular where bodies keep an axis, and all directions.
+SAME_AXIS = ((2, 0), (2, 1))
+SAME_DIRECTIONS = ((0, 1), (1, 2), (2, 0))
+
 # What a joint leaves of the turning of its bodies against each other.
 Keeps: TypeAlias = Literal["axis", "directions"] | None
 
@@ -160,8 +164,22 @@ class Driven(AbstractLaw):
 
 
 @dataclass(frozen=True)
+class Flywheel(AbstractLaw):
+    """Keeps a measure at the coordinate of an inerter, which is in `numbers["value"]`."""
+
+    measure: AbstractMeasure
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return self.measure.reads
+
+    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Multipliers:
+        return self.measure.away(a, b, numbers, numbers["value"])
+
+
+@dataclass(frozen=True)
 class Missed(AbstractLaw):
-    """The difference of a driven measure from `numbers["value"]`."""
+    """The difference of a measure from `numbers["value"]`, at which it is to be kept."""
 
     measure: AbstractMeasure
 

@@ -40,13 +40,21 @@ class Links(NamedTuple):
     b: np.ndarray
 
 
+class Inerters(NamedTuple):
+    """All inerters with the same law, and the index of the coordinate of each."""
+
+    links: Links
+    q: np.ndarray
+    v: np.ndarray
+
+
 @dataclass(frozen=True)
 class Layout:
     """The structure of a scene, without its numbers; compared by value.
 
-    Coordinates and velocities are ordered like the bodies among the parts. The frames of
-    bodies are numbered kind by kind, starting from 1, so that a table of all frames is a
-    concatenation.
+    Coordinates and velocities are ordered like the bodies among the parts; those of
+    inerters follow, one each. The frames of bodies are numbered kind by kind, starting from
+    1, so that a table of all frames is a concatenation.
     """
 
     dimension: int
@@ -57,6 +65,7 @@ class Layout:
     potentials: tuple[tuple[str, Callable], ...]
     has_gravity: bool
     drives: tuple[Link, ...] = ()
+    inerters: tuple[Link, ...] = ()
 
     @cached_property
     def body_groups(self) -> tuple[Bodies, ...]:
@@ -95,9 +104,20 @@ class Layout:
     def drive_groups(self) -> tuple[Links, ...]:
         return _links(self.drives)
 
+    @cached_property
+    def inerter_groups(self) -> tuple[Inerters, ...]:
+        place = {link.name: k for k, link in enumerate(self.inerters)}
+        q = self.num_coordinates - len(place)
+        v = self.num_velocities - len(place)
+        groups = []
+        for links in _links(self.inerters):
+            own = np.array([place[name] for name in links.names])
+            groups.append(Inerters(links, q + own, v + own))
+        return tuple(groups)
+
     @property
     def has_constraints(self) -> bool:
-        return bool(self.joints or self.constraints)
+        return bool(self.joints or self.constraints or self.inerters)
 
     @property
     def rigid_bodies(self) -> np.ndarray | None:
@@ -122,6 +142,7 @@ class Layout:
             joints=self.joint_groups,
             forces=self.force_groups,
             drives=self.drive_groups,
+            inerters=[group.links for group in self.inerter_groups],
         )
         return {
             section: {
@@ -134,11 +155,13 @@ class Layout:
 
     @property
     def num_coordinates(self) -> int:
-        return sum(kind.num_coordinates for _, kind in self.bodies)
+        own = sum(kind.num_coordinates for _, kind in self.bodies)
+        return own + len(self.inerters)
 
     @property
     def num_velocities(self) -> int:
-        return sum(kind.num_velocities for _, kind in self.bodies)
+        own = sum(kind.num_velocities for _, kind in self.bodies)
+        return own + len(self.inerters)
 
 
 def numbers_of(bodies: Iterable[tuple[str, AbstractBodyCoordinates]]) -> dict[str, int]:

@@ -95,16 +95,17 @@ class PlanarTurn(AbstractMeasure):
         return b.angle - a.angle
 
 
-@dataclass(frozen=True)
-class Turn(AbstractMeasure):
-    """The angle about a common axis in space, which jumps at half a turn; its rate does
-    not."""
+class AbstractTurn(AbstractMeasure):
+    """An angle in space, which jumps at half a turn; its rate does not."""
 
     is_angle = True
-    reads = ("axes",)
+
+    @abc.abstractmethod
+    def components(self, a: Frame, b: Frame, numbers: Numbers) -> tuple[Scalar, Scalar]:
+        """Cosine and sine of the angle."""
 
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Scalar:
-        along, across = self._components(a, b, numbers)
+        along, across = self.components(a, b, numbers)
         return jnp.arctan2(across, along)
 
     def away(self, a: Frame, b: Frame, numbers: Numbers, value: Any) -> Multipliers:
@@ -120,11 +121,18 @@ class Turn(AbstractMeasure):
         self, a: Frame, b: Frame, numbers: Numbers, value: Any
     ) -> tuple[Scalar, Scalar]:
         """Cosine and sine of the difference of the angle and a value."""
-        along, across = self._components(a, b, numbers)
+        along, across = self.components(a, b, numbers)
         c, s = jnp.cos(value), jnp.sin(value)
         return along * c + across * s, across * c - along * s
 
-    def _components(self, a: Frame, b: Frame, numbers: Numbers) -> tuple[Scalar, Scalar]:
+
+@dataclass(frozen=True)
+class Turn(AbstractTurn):
+    """The angle about an axis that both bodies have in common."""
+
+    reads = ("axes",)
+
+    def components(self, a: Frame, b: Frame, numbers: Numbers) -> tuple[Scalar, Scalar]:
         x, y = (a.direction(numbers["frame_a"][k]) for k in (0, 1))
         turned = b.direction(numbers["frame_b"][0])
         return jnp.sum(turned * x), jnp.sum(turned * y)

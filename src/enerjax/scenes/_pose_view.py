@@ -141,4 +141,6 @@ def lift(layout: Layout, q: Coordinates, v: Velocities) -> Coordinates:
     for group in layout.body_groups:
         lifted = jax.vmap(group.kind.lift)(rows(q, group.q), rows(v, group.v))
         rates = rates.at[group.q].set(lifted)
+    for group in layout.inerter_groups:
+        rates = rates.at[group.q].set(v[group.v])
     return rates

@@ -12,9 +12,9 @@ from .._system import State
 from .._types import Real, Scalar
 from ._feedback import link_of, measure_of, Moving
 from ._functions import at_time, pushes
-from ._laws import AbstractForceLaw, AbstractSpringLaw, Driven, Length
+from ._laws import AbstractForceLaw, AbstractSpringLaw, Driven, Flywheel, Length
 from ._layout import Layout
-from ._measures import Turn
+from ._measures import AbstractTurn
 from ._parameters import Parameters
 from ._relative_motions import each
 
@@ -29,9 +29,9 @@ class Readout(NamedTuple):
     - `rate`: its rate (length per time, radians per time).
     - `force`: a force (energy per length), or a torque (energy) for an angle. It is
       positive if it pushes points apart or turns the second body counterclockwise, so
-      `force * rate` is its power. `None` if the part has no force. The force of a drive or
-      a rod (`Distance`) follows from multipliers: it is not known for a `State`, and for a
-      run it is the mean over the step that ends at the row.
+      `force * rate` is its power. `None` if the part has no force. The force of a drive,
+      an inerter or a rod (`Distance`) follows from multipliers: it is not known for a
+      `State`, and for a run it is the mean over the step that ends at the row.
 
     The value of a revolute or cylindrical joint is its angle, that of a prismatic joint its
     displacement. In the plane an angle is the difference of the angles of the bodies. In
@@ -73,10 +73,11 @@ def readout(
 
     found = each(of_state, q, v, t)
     law = link_of(layout, name, args)[0].law
-    if multipliers is None or not isinstance(law, Driven | Length):
+    if multipliers is None or not isinstance(law, Driven | Flywheel | Length):
         return found
     along = multipliers if found.value.ndim == q.ndim else multipliers[..., 0]
-    # The row of a drive has slope one; that of a rod is a difference of squared lengths.
+    # The rows of drives and inerters have slope one; that of a rod is a difference of
+    # squared lengths.
     slope = 2 * found.value if isinstance(law, Length) else 1.0
     return found._replace(force=-slope * along)
 
@@ -96,7 +97,7 @@ def measured_along(
     elif isinstance(sol, ConsistentStart | Equilibrium):
         state, times, turns = sol.state, t, False
     else:
-        state, times, turns = sol.ys, sol.ts, isinstance(measure, Turn)
+        state, times, turns = sol.ys, sol.ts, isinstance(measure, AbstractTurn)
     times = jnp.asarray(times, state.q.dtype)
     multipliers = None
     if name in rows and not isinstance(sol, State):

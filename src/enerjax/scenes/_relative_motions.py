@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from .._types import Coordinates, Scalar
 from ._frames import Frame, Numbers, Point
-from ._laws import Driven
+from ._laws import Driven, Flywheel
 from ._layout import Layout, Links
 from ._parameters import Parameters
 from ._pose_view import View
@@ -56,7 +56,7 @@ def reaction(
     ends: tuple[str, str],
     args: Parameters,
 ) -> Reaction:
-    """The reaction of a joint or drive between two bodies, in one state."""
+    """The reaction of a joint, drive or inerter between two bodies, in one state."""
     group, numbers = _link(layout, joint, args)
     a, b = (View(layout, q).frame(body) for body in ends)
     pivot = pivot_of(b, numbers)
@@ -68,16 +68,18 @@ def reaction(
 
 
 def _link(layout: Layout, name: str, args: Parameters) -> tuple[Links, Numbers]:
-    """A joint or drive with the law of its rows, and its numbers."""
+    """A joint, drive or inerter with the law of its rows, and its numbers."""
     places = layout.places
     if name in places["joints"]:
         number, _ = places["joints"][name]
         return layout.joint_groups[number], args["joints"][name]
-    number, _ = places["drives"][name]
-    group = layout.drive_groups[number]
-    assert isinstance(group.law, Driven)
-    # The rows of a drive have the derivatives of its measure.
-    return group._replace(law=group.law.measure), args["drives"][name]
+    section = "drives" if name in places["drives"] else "inerters"
+    number, _ = places[section][name]
+    inerters = [group.links for group in layout.inerter_groups]
+    group = (layout.drive_groups if section == "drives" else inerters)[number]
+    assert isinstance(group.law, Driven | Flywheel)
+    # The rows of drives and inerters have the derivatives of their measures.
+    return group._replace(law=group.law.measure), args[section][name]
 
 
 def each(function: Callable, q: Array, *others: Array) -> Any:

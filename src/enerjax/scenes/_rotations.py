@@ -20,6 +20,12 @@ def mass_and_inertia(name: str, mass: Any, inertia: Any, *, may_be_flat: bool) -
     return dict(mass=mass, inertia=matrix)
 
 
+def is_flat(matrix: np.ndarray) -> bool:
+    """Whether a body with this inertia has no mass along one of its axes."""
+    moments = np.linalg.eigvalsh(matrix)
+    return bool(moments.sum() / 2 - moments[-1] <= 1e-9 * moments[-1])
+
+
 def _check_inertia(name: str, matrix: np.ndarray, may_be_flat: bool) -> None:
     size = np.max(np.abs(matrix))
     if np.max(np.abs(matrix - matrix.T)) > 1e-9 * size:
@@ -31,7 +37,7 @@ def _check_inertia(name: str, matrix: np.ndarray, may_be_flat: bool) -> None:
             f"No body has the `inertia` of '{name}', principal moments {moments.tolist()}: "
             "all must be positive, and none larger than the sum of the other two."
         )
-    if thinnest <= 1e-9 * size and not may_be_flat:
+    if is_flat(matrix) and not may_be_flat:
         raise ValueError(
             f"'{name}' is flat: of its principal moments {moments.tolist()} the largest is "
             "the sum of the others. A `RigidBody` needs mass along each of its axes: give "

@@ -16,7 +16,7 @@ from ._functions import drives_at
 from ._gaps import by_name, Measured, measured
 from ._laws import Driven, Missed
 from ._layout import Layout
-from ._measures import Turn
+from ._measures import AbstractTurn
 from ._parameters import Parameters
 from ._pose_view import evaluate, lift, View
 
@@ -117,9 +117,10 @@ def _check_turns(layout: Layout, start: State, t: Real, args: Parameters) -> Sta
     """
     t = jnp.asarray(t, start.q.dtype)
     for group, numbers in drives_at(layout, t, args):
-        if not isinstance(group.law, Driven) or not isinstance(group.law.measure, Turn):
+        measure = group.law.measure if isinstance(group.law, Driven) else None
+        if not isinstance(measure, AbstractTurn):
             continue
-        missed = group._replace(law=Missed(group.law.measure))
+        missed = group._replace(law=Missed(measure))
         error = jnp.abs(evaluate(missed, View(layout, start.q), numbers))[:, 0]
         opposite = jax.lax.stop_gradient(error > np.pi / 2)
         message = (

@@ -28,7 +28,9 @@ def summary(
         freedoms = max(independent, 0) if counted is None else counted
         least = "at least " if counted is None else ""
     world = "the plane" if layout.dimension == 2 else "space"
-    holders = "joints and drives" if layout.drives else "joints"
+    holders = " and ".join(
+        ["joints", *["inerters"] * bool(layout.inerters), *["drives"] * bool(layout.drives)]
+    )
     lines = [
         f"A scene in {world}: {layout.num_coordinates} coordinates, {held} constraints of "
         f"{holders}, {least}{freedoms} degree{'' if freedoms == 1 else 's'} of freedom."
@@ -46,8 +48,10 @@ def summary(
         free = "" if name in joined else ", connected to nothing"
         lines.append(line(name, f"q[{first}:{last}]{free}"))
         first = last
+    own = {link.name: first + k for k, link in enumerate(layout.inerters)}
     for name, place in rows.items():
         between = " - ".join(ends[name]) + ", " if name in ends else ""
+        between += f"q[{own[name]}], " if name in own else ""
         lines.append(line(name, f"{between}constraint[{place.start}:{place.stop}]"))
     others = [name for name in kinds if name not in bodies and name not in rows]
     lines += [line(name, " - ".join(ends.get(name, ()))) for name in others]

@@ -1,13 +1,15 @@
 """Forces. Points are passed as for joints, in the frames of the bodies.
 
-Springs and constant forces have a potential. Dampers, actuators and loads have none: their
-work is in `sol.audit.work`. Functions depend on the time and the `args` of the system.
+Springs and constant forces have a potential, inerters a kinetic energy. Dampers, actuators
+and loads have neither: their work is in `sol.audit.work`. Functions depend on the time and
+the `args` of the system.
 """
 
 from .._types import Real, Vector
 from ._arguments import number
 from ._ends import Ends
 from ._frames import GROUND, Numbers
+from ._inerters import Inerter as Inerter, TorsionInerter as TorsionInerter
 from ._laws import Elastic, Steady
 from ._loads import (
     Actuator as Actuator,

@@ -23,15 +23,17 @@ from .._types import Real, Vector
 from ._arguments import module_of, positive
 from ._ends import Ends
 from ._frames import Numbers
-from ._laws import AbstractConstraintLaw, Alignment, Curve, Length
+from ._laws import (
+    AbstractConstraintLaw,
+    Alignment,
+    Curve,
+    Length,
+    SAME_AXIS,
+    SAME_DIRECTIONS,
+)
 from ._measures import AbstractMeasure, PlanarTurn, Slide, Turn
 from ._part import AbstractFunctionOfPose, AbstractPart, only_parts, PoseFunction
 from ._user_functions import check_function, vector_of
-
-
-# Pairs of axes that stay perpendicular where bodies keep an axis, and all directions.
-_SAME_AXIS = ((2, 0), (2, 1))
-_SAME_DIRECTIONS = ((0, 1), (1, 2), (2, 0))
 
 
 def _turn_in_plane(ends: Ends) -> AbstractMeasure | None:
@@ -84,7 +86,7 @@ class Revolute(AbstractAxisJoint):
         if ends.dimension == 2:
             ends.refuse_axes(self.axis, self.axis_b)
             return Alignment(None, measure=_turn_in_plane(ends)), points
-        law = Alignment(None, _SAME_AXIS, Turn(), "axis")
+        law = Alignment(None, SAME_AXIS, Turn(), "axis")
         return law, points | ends.axes(self.axis, self.axis_b)
 
 
@@ -112,7 +114,7 @@ class Prismatic(AbstractPointJoint):
         numbers = ends.points(self.point_a, self.point_b) | ends.axes(self.axis)
         if ends.dimension == 2:
             return Alignment((1,), ((0, 1),), Slide()), numbers
-        return Alignment((0, 1), _SAME_DIRECTIONS, Slide(), "directions"), numbers
+        return Alignment((0, 1), SAME_DIRECTIONS, Slide(), "directions"), numbers
 
 
 class Cylindrical(AbstractAxisJoint):
@@ -124,7 +126,7 @@ class Cylindrical(AbstractAxisJoint):
     def resolve(self, ends: Ends) -> tuple[AbstractConstraintLaw, Numbers]:
         ends.only_in_space("A cylindrical joint")
         numbers = ends.points(self.point_a, self.point_b)
-        law = Alignment((0, 1), _SAME_AXIS, Turn(), "axis")
+        law = Alignment((0, 1), SAME_AXIS, Turn(), "axis")
         return law, numbers | ends.axes(self.axis, self.axis_b)
 
 
@@ -137,7 +139,7 @@ class Planar(AbstractAxisJoint):
     def resolve(self, ends: Ends) -> tuple[AbstractConstraintLaw, Numbers]:
         ends.only_in_space("A planar joint")
         numbers = ends.points(self.point_a, self.point_b)
-        law = Alignment((2,), _SAME_AXIS, Turn(), "axis")
+        law = Alignment((2,), SAME_AXIS, Turn(), "axis")
         return law, numbers | ends.axes(self.axis, self.axis_b)
 
 
@@ -152,7 +154,7 @@ class Fixed(AbstractPointJoint):
         numbers = ends.points(self.point_a, self.point_b) | ends.axes(axis)
         if ends.dimension == 2:
             return Alignment(None, ((0, 1),)), numbers
-        return Alignment(None, _SAME_DIRECTIONS, keeps="directions"), numbers
+        return Alignment(None, SAME_DIRECTIONS, keeps="directions"), numbers
 
 
 class Distance(AbstractPointJoint):

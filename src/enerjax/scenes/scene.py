@@ -12,7 +12,7 @@ from .._programs import is_known
 from .._run import Solution
 from .._system import State, System
 from .._types import Coordinates, Real, Vector
-from ._compile import compile_parts, join, sort_parts
+from ._compile import compile_parts, LINKS, sort_parts, start_of
 from ._constraint_rows import check_reacting, row_names, rows_of
 from ._default_shapes import all_shapes, given_shapes
 from ._feedback import Moving
@@ -27,9 +27,6 @@ from ._relative_motions import each, Reaction, reaction
 from ._start import check_poses, closed_start, gaps_of, PartialStart
 from ._summary import summary
 from .bodies import AbstractBody
-from .drives import AbstractDrive
-from .forces import AbstractForce
-from .joints import AbstractJoint
 from .shapes import Shape
 
 
@@ -87,15 +84,11 @@ class Scene:
         found = sort_parts(parts)
         bodies: list[AbstractBody] = found[AbstractBody]
         self._layout, self.args = compile_parts(found, gravity, dict(args or {}))
-        self._ends = {
-            part.name: (part.a, part.b)
-            for kind in (AbstractJoint, AbstractForce, AbstractDrive)
-            for part in found[kind]
-        }
+        self._ends = {part.name: (part.a, part.b) for kind in LINKS for part in found[kind]}
         self._kinds = {part.name: type(part).__name__ for part in parts}
         self._shapes = given_shapes(bodies, ground)
         self.system = make_system(self._layout, redundant)
-        self.q, self.v = (join([getattr(b, x) for b in bodies]) for x in ("q", "v"))
+        self.q, self.v = start_of(self._layout, self.args, bodies)
         check_laws(self._layout, self.q, self.args)
         self._rows = rows_of(self._layout, self.q, self.args)
         if self.system.force is not None:  # checks the users' functions
@@ -193,9 +186,9 @@ class Scene:
     ) -> Readout:
         """The length or angle of a part along a run, its rate, and the force along it.
 
-        Parts are springs, dampers, actuators, loads, drives, hinges, sliders and rods. For
-        a start or a state, `t` is its time. Pass the `args` of the run if they are not
-        those of the scene.
+        Parts are springs, dampers, inerters, actuators, loads, drives, hinges, sliders and
+        rods. For a start or a state, `t` is its time. Pass the `args` of the run if they
+        are not those of the scene.
 
         Along a run, angles of hinges in space include full turns; for a single state these
         are not known.
