@@ -185,15 +185,17 @@ class ChainGeometry:
         slides = axes[self.slides]
         if np.linalg.matrix_rank(slides, tol=_PARALLEL) < len(slides):
             raise ValueError(f"{told} are slides of which one follows from the others.")
-        if len(self.hinges) == 3 and abs(self._handedness()) < _PARALLEL:
+        if len(self.hinges) == 3 and abs(self._side()) < _PARALLEL:
             raise ValueError(
                 f"{told} start in gimbal lock: the axes of its three hinges are in one "
                 "plane. Start from another pose, a keyframe."
             )
 
-    def _handedness(self) -> float:
-        """The triple product of three axes at the start, whose sign stays."""
-        return float(np.linalg.det(self.here.start_axes[self.hinges]))
+    def _side(self) -> float:
+        """On which side of the plane of the first and the last of three axes the second
+        is, at the start; it stays there."""
+        first, second, last = self.here.start_axes[self.hinges]
+        return float(second @ np.cross(first, last))
 
     def numbers(self) -> Numbers:
         here, last = self.here, len(self.turning)
@@ -215,7 +217,7 @@ class ChainGeometry:
         if len(axes) > 1:
             found |= dict(cosines=np.sum(axes[1:] * axes[:-1], axis=1))
         if len(axes) == 3:
-            found |= dict(branch=np.sign(self._handedness()))
+            found |= dict(branch=np.sign(self._side()))
         if not self.chain.meet:
             links = np.diff(points, axis=0)
             between = [self._in_stage(k + 1, link) for k, link in enumerate(links)]
