@@ -159,7 +159,8 @@ def _across(stages: Stages, numbers: Numbers) -> Multipliers:
     if chain.slides_together:
         normals = [stages.direction(chain.stages[0], x) for x in numbers["normals"]]
     elif len(chain.stages) == 2:
-        normals = [jnp.cross(*stages.slides)]
+        first, second = stages.slides
+        normals = [jnp.cross(first, second)]
     else:
         normals = []
     rows: list[Array] = [jnp.sum(slid * normal) for normal in normals]

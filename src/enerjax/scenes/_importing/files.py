@@ -4,8 +4,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from .._rotations import is_flat
 from ..bodies import QuaternionBody, RigidBody
 from ..scene import Scene
@@ -17,6 +15,7 @@ from .joints import joints_of
 from .reading import read_mjcf, read_urdf
 from .refusals import check_names, refuse
 from .tree import Names, Tree
+from .visuals import shapes_of
 
 
 def from_mjcf(
@@ -122,7 +121,10 @@ def _scene_of(
     forces = forces_of(tree, coordinates, names)
     bodies = [_body(tree, root) for root in tree.roots]
     every = [*bodies, *joints, *loops, *forces, *parts]
-    build = lambda redundant: Scene(every, gravity_of(model), args, redundant=redundant)
+    ground = shapes_of(tree, None)
+    build = lambda redundant: Scene(
+        every, gravity_of(model), args, redundant=redundant, ground=ground
+    )
     scene = build(False)
     # Loops of hinges with parallel axes repeat constraints; trees never do.
     return build(True) if loops and scene.mobility().redundant else scene
@@ -162,4 +164,5 @@ def _body(tree: Tree, root: int) -> RigidBody | QuaternionBody:
         rotation,
         velocity=velocity,
         angular_velocity=angular,
+        shape=shapes_of(tree, root) or None,
     )

@@ -173,8 +173,8 @@ class ChainGeometry:
         axes, told = self.here.axes, f"The joints of '{self.here.name}'"
         if len(self.hinges) > 3:
             raise ValueError(
-                f"{told} are {len(self.hinges)} hinges in a row. Their angles do not follow "
-                "from the pose of the body; at most three do. Put bodies between them."
+                f"{told} are {len(self.hinges)} hinges in a row. At most three angles "
+                "follow from the pose of a body: put other bodies between them."
             )
         for i, j in zip(self.hinges, self.hinges[1:], strict=False):
             if np.linalg.norm(np.cross(axes[i], axes[j])) < _PARALLEL:

@@ -1,5 +1,7 @@
 """The parts of an imported scene, whose laws and numbers follow from the file."""
 
+from typing import Any
+
 import equinox as eqx
 
 from .._ends import Ends
@@ -17,7 +19,7 @@ class AbstractGiven(AbstractPart):
     law: eqx.AbstractVar[AbstractLaw]
     numbers: eqx.AbstractVar[Numbers]
 
-    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+    def resolve(self, ends: Ends) -> tuple[Any, Numbers]:
         del ends
         return self.law, self.numbers
 

@@ -132,8 +132,9 @@ class Tree:
 def together(parts: list[Weight]) -> Weight:
     """The weight of several that are rigidly connected."""
     mass = sum(part.mass for part in parts)
-    centre = sum(part.mass * part.centre for part in parts) / mass
-    inertia = np.zeros((3, 3))
+    centre, inertia = np.zeros(3), np.zeros((3, 3))
+    for part in parts:
+        centre += part.mass / mass * part.centre
     for part in parts:
         arm = part.centre - centre
         steiner = arm @ arm * np.eye(3) - np.outer(arm, arm)
