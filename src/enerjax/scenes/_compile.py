@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._programs import compiled, is_known
-from .._types import Coordinates
+from .._types import Coordinates, Velocities
 from ._arguments import module_of, number
 from ._ends import Ends, Hinge, Hinges
 from ._frames import Frame, GROUND, Numbers
@@ -18,7 +18,7 @@ from ._law_checks import resolved_part
 from ._laws import Flywheel
 from ._layout import Layout, Link, numbers_of
 from ._parameters import Parameters
-from ._pose_view import evaluate, View
+from ._pose_view import evaluate, lift, View
 from .bodies import AbstractBody
 from .drives import AbstractDrive
 from .forces import AbstractForce, Potential
@@ -215,21 +215,31 @@ def start_of(
     q, v = (join([getattr(body, x) for body in bodies]) for x in ("q", "v"))
     if not layout.inerters:
         return q, v
-    own = _values_of_inerters(layout, q, args)
-    return jnp.concatenate([q, own]), jnp.concatenate([v, jnp.zeros_like(own)])
+    unknown = jnp.zeros((len(layout.inerters),), q.dtype)
+    padded = (jnp.concatenate([x, unknown]) for x in (q, v))
+    values, rates = _of_inerters(layout, *padded, args)
+    return jnp.concatenate([q, values]), jnp.concatenate([v, rates])
 
 
 @compiled
-def _values_of_inerters(layout: Layout, q: Coordinates, args: Parameters) -> Array:
-    """The lengths and angles of all inerters, in the order of their coordinates."""
-    view, first = View(layout, q), q.size
-    own = jnp.zeros((len(layout.inerters),), q.dtype)
-    groups = zip(layout.inerter_groups, args.tables["inerters"], strict=True)
-    for group, numbers in groups:
-        assert isinstance(group.links.law, Flywheel)
-        measured = group.links._replace(law=group.links.law.measure)
-        own = own.at[group.q - first].set(evaluate(measured, view, numbers))
-    return own
+def _of_inerters(
+    layout: Layout, q: Coordinates, v: Velocities, args: Parameters
+) -> tuple[Array, Array]:
+    """The lengths and angles of all inerters, in the order of their coordinates, and their
+    rates, from the coordinates and velocities of the bodies."""
+    first = q.size - len(layout.inerters)
+
+    def values(x: Coordinates) -> Array:
+        own = jnp.zeros((len(layout.inerters),), x.dtype)
+        groups = zip(layout.inerter_groups, args.tables["inerters"], strict=True)
+        for group, numbers in groups:
+            assert isinstance(group.links.law, Flywheel)
+            measured = group.links._replace(law=group.links.law.measure)
+            found = evaluate(measured, View(layout, x), numbers)
+            own = own.at[group.q - first].set(found)
+        return own
+
+    return jax.jvp(values, (q,), (lift(layout, q, v),))
 
 
 def join(parts: Sequence[Any]) -> Array:

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._frames import GROUND
+from .._rotations import rotation_matrix
 from . import mujoco
 from .coefficients import armature
 
@@ -63,7 +64,8 @@ class Tree:
 
     def pose(self, body: int) -> tuple[np.ndarray, np.ndarray]:
         """The rotation matrix and the origin of the frame of a body, in space."""
-        return self.data.xmat[body].reshape(3, 3), self.data.xpos[body]
+        # MuJoCo's matrices are off by the round-off of the whole tree.
+        return rotation_matrix("a body", self.data.xquat[body]), self.data.xpos[body]
 
     def place(self, body: int) -> Place:
         """The frame of a body of the file in the scene."""
