@@ -216,8 +216,8 @@ def start_of(
     if not layout.inerters:
         return q, v
     unknown = jnp.zeros((len(layout.inerters),), q.dtype)
-    padded = (jnp.concatenate([x, unknown]) for x in (q, v))
-    values, rates = _of_inerters(layout, *padded, args)
+    q_all, v_all = (jnp.concatenate([x, unknown]) for x in (q, v))
+    values, rates = _of_inerters(layout, q_all, v_all, args)
     return jnp.concatenate([q, values]), jnp.concatenate([v, rates])
 
 
