@@ -147,6 +147,11 @@ def _turned_to(up: Array) -> Rotation:
     return Rotation.align_vectors(up[None], [[0.0, 0.0, 1.0]])[0]
 
 
+def _quaternions(turns: Rotation) -> Array:
+    """Unit quaternions, scalar first."""
+    return np.roll(turns.as_quat(), 1, axis=-1)
+
+
 def _set_camera(server: Any, extent: _Extent, up: Array, is_flat: bool) -> None:
     server.scene.set_up_direction(up)
     towards = np.array([0.25, -1.0, 0.2] if is_flat else [0.7, -1.0, 0.5])
@@ -168,7 +173,7 @@ def _add_grid(server: Any, extent: _Extent, up: Array) -> None:
         cell_size=cell / 5,
         section_size=cell,
         position=extent.centre + (lowest - extent.centre @ up) * up,
-        wxyz=_turned_to(up).as_quat(scalar_first=True),
+        wxyz=_quaternions(_turned_to(up)),
     )
 
 
@@ -188,7 +193,7 @@ def _body_node(server: Any, number: int, body: BodyMotion) -> _BodyNode:
 
     # A slash in a name would make one body the child of another.
     path = f"/{number} {body.name}".replace("/", "|").replace("|", "/", 1)
-    turn = Rotation.from_matrix(body.rotation).as_quat(scalar_first=True)
+    turn = _quaternions(Rotation.from_matrix(body.rotation))
     pose = dict(position=body.position[0], wxyz=turn[0])
     frame = server.scene.add_frame(path, show_axes=False, **pose)
     default = GREY if body.name == GROUND else color_of(f"C{number % 10}")

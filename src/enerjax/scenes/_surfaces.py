@@ -45,17 +45,18 @@ def _patches(points: Array, faces: Array) -> Array:
     """The number of the patch that each triangle belongs to."""
     a, b, c = points[faces].swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = normals / np.where(lengths > 0, lengths, 1)
+    areas = np.linalg.norm(normals, axis=1)
+    # Triangles without an area, at the tips of round ends, are part of any patch.
+    is_thin = areas <= 1e-9 * areas.max()
+    normals = normals / np.where(is_thin, 1, areas)[:, None]
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     owner = np.repeat(np.arange(len(faces)), 3)
     order = np.lexsort(edges.T)
     edges, owner = edges[order], owner[order]
     shared = np.flatnonzero((edges[1:] == edges[:-1]).all(axis=1))
     first, second = owner[shared], owner[shared + 1]
-    # Triangles without an area, at the tips of round ends, are part of any patch.
     smooth = np.sum(normals[first] * normals[second], axis=1) > np.cos(_SHARP)
-    smooth |= (lengths[first] == 0)[:, 0] | (lengths[second] == 0)[:, 0]
+    smooth |= is_thin[first] | is_thin[second]
     pairs = first[smooth], second[smooth]
     graph = coo_array((np.ones(len(pairs[0])), pairs), shape=(len(faces),) * 2)
     return connected_components(graph, directed=False)[1]
