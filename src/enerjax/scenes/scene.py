@@ -327,6 +327,44 @@ class Scene:
         shown = self.motion(sol, times, args)
         return animate(shown, whole, sol, ax, fps, speed, traces, energy, units)
 
+    def view(
+        self,
+        sol: Solution | ConsistentStart | Equilibrium | State | None = None,
+        args: Parameters | None = None,
+        *,
+        speed: float = 1.0,
+        fps: float = 30.0,
+    ) -> Any:
+        """A run in space, which a browser plays, scrubs and turns.
+
+        Notebooks show it. `scene.view(sol).open()` shows it in the browser, and
+        `scene.view(sol).save("run.html")` writes a page that opens without Python, and
+        without a network. Frames are at equal times whatever the steps were; between rows
+        the motion is interpolated as by `motion`. A scene in the plane stands upright.
+
+        **Arguments:**
+
+        - `sol`: a run whose unit of time is the second, of which the rows that it reached
+          are shown; or one state, by default the poses of the bodies.
+        - `args`: those of the run if they are not those of the scene.
+        - `speed`: of the film, relative to the motion: 0.1 shows it ten times slower.
+        - `fps`: frames per second.
+
+        **Returns:** the page, with the methods `open` and `save`.
+
+        **Raises:** `ImportError` without the extra `view`. As `motion`, and `ValueError`
+        for a run that is too short or too long for a film at this speed.
+        """
+        from .._pictures import frame_times
+        from ._recording import record
+
+        shown = self.motion(sol, None, args)
+        if isinstance(sol, Solution):
+            times = frame_times(shown.ts[0], shown.ts[-1], speed, fps)
+            shown = self.motion(sol, times, args)
+        numbers = self.args if args is None else args
+        return record(shown, numbers.own.get("gravity"), speed, fps)
+
     def plot_reactions(
         self,
         sol: Solution,
