@@ -141,8 +141,7 @@ def _by_chord(
         return joined(unmerged(lambda x: leaves_of(fn(unravel(x), args)))(x))
 
     def solve(right: Array) -> Array:
-        correct = lambda x: leaves_of(chord.correct(unravel(x), args, prepared))
-        return joined(unmerged(correct)(right))
+        return joined(leaves_of(chord.correct(unravel(right), args, prepared)))
 
     last = chord_iterations(value, solve, newton, start, guess)
     return Root(
