@@ -39,7 +39,22 @@ class View:
 
     @cached_property
     def axes(self) -> Float[Array, "bodies d d"]:
-        return self._table("axes", jnp.eye(self.layout.dimension, dtype=self.q.dtype)[None])
+        return self._with_second(self._first_axes)
+
+    @cached_property
+    def _first_axes(self) -> Float[Array, "bodies n d"]:
+        """In the plane the first axis alone, from which the second follows; all in space.
+
+        To find an axis in a table takes longer than to turn one.
+        """
+        axes = self._table("axes", jnp.eye(self.layout.dimension, dtype=self.q.dtype)[None])
+        return axes[:, :1] if self.layout.dimension == 2 else axes
+
+    def _with_second(self, first: Float[Array, "n m d"]) -> Float[Array, "n d d"]:
+        if self.layout.dimension == 3:
+            return first
+        normal = jnp.stack([-first[..., 1], first[..., 0]], axis=-1)
+        return jnp.concatenate([first, normal], axis=1)
 
     @cached_property
     def angles(self) -> Float[Array, " bodies"]:
@@ -57,7 +72,7 @@ class View:
         if "origin" in reads:
             fields["origin"] = self._origins_of(bodies)
         if "axes" in reads and self.layout.turning[bodies].any():
-            fields["axes"] = rows(self.axes, bodies)
+            fields["axes"] = self._with_second(rows(self._first_axes, bodies))
         if "angle" in reads:
             fields["angle"] = rows(self.angles, bodies)
         return Frame(**fields)
