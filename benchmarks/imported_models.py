@@ -10,6 +10,8 @@ all mass centres over half a second, in metres: at the step `h`, at half of it, 
 extrapolated from both to vanishing steps. Writes imported_models.csv.
 """
 
+# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
+
 import argparse
 import dataclasses
 import tempfile
@@ -18,7 +20,7 @@ from typing import Any
 
 import harness
 import jax
-import mujoco  # pyright: ignore[reportMissingImports]
+import mujoco
 import numpy as np
 
 import enerjax as ej

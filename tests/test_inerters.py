@@ -31,6 +31,7 @@ def test_an_inerter_shares_a_force_among_two_masses():
     assert np.allclose(found.accelerations, [a1, 0, a2, 0, a2 - a1], rtol=1e-14, atol=1e-14)
     told = scene.measure(found, "screw")
     assert (float(told.value), float(told.rate)) == (1.0, 0.0)
+    assert told.force is not None
     assert float(told.force) == pytest.approx(-b * (a2 - a1), rel=1e-13)
     assert np.allclose(scene.reaction(found, "screw").force, [m2 * a2, 0.0], atol=1e-14)
 
@@ -39,6 +40,7 @@ def test_an_inerter_shares_a_force_among_two_masses():
 def test_a_rotor_shares_a_torque_among_two_bodies(in_space):
     """As above, for two wheels on one axle; and a derivative with respect to the rotor."""
     j1, j2, b, torque, axis = 2.0, 3.0, 1.5, 4.0, [0.0, 0.0, 1.0]
+    push = lambda t, args: jnp.asarray(torque)
 
     def scene(b):
         if not in_space:
@@ -51,7 +53,7 @@ def test_a_rotor_shares_a_torque_among_two_bodies(in_space):
             hinge = lambda name, x: ej.joints.Revolute(name, "ground", x, axis=axis)
             rotor = ej.forces.TorsionInerter("rotor", "first", "second", b, axis)
         motor = ej.forces.TorsionActuator(
-            "motor", "ground", "first", lambda t, args: torque, axis if in_space else None
+            "motor", "ground", "first", push, axis if in_space else None
         )
         wheels = [wheel("first", j1), wheel("second", j2)]
         hinges = [hinge("h1", "first"), hinge("h2", "second")]

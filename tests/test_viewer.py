@@ -26,7 +26,7 @@ def contents(recording):
     import zstandard
 
     found = re.search(r'__VISER_EMBED_DATA__="([^"]+)"', recording.page)
-    packed = base64.b64decode(found.group(1))[8:]
+    packed = base64.b64decode(found.group(1))[8:]  # pyright: ignore
     data = zstandard.ZstdDecompressor().decompressobj().decompress(packed)
     size = int.from_bytes(data[:8], "little")
     decoded = msgspec.msgpack.decode(data[8 : 8 + size])
@@ -188,7 +188,7 @@ def test_a_browser_plays_scrubs_and_turns_the_page(flight, tmp_path):
         (left, many), (right, more) = middle_of_red(early), middle_of_red(late)
         assert many > 50
         assert more > 50
-        assert right - left > 0.1 * width
+        assert right - left > 0.1 * width  # pyright: ignore
         page.press(width / 2, height / 4, to=(width / 2 + 60, height / 4))
         page.picture()
         turned = page.picture()
