@@ -145,15 +145,9 @@ def _points_at(masses: np.ndarray, length: float, end: float) -> np.ndarray:
 
 
 def _points(
-    name: str,
-    count: int,
-    steps: int,
-    bars: Bars,
-    *,
-    scheme: str = PRESERVING,
-    h: float = 1e-3,
+    name: str, count: int, steps: int, bars: Bars, scheme: str = PRESERVING
 ) -> Work:
-    masses, length = np.full(count, 1 / count), 1 / count
+    masses, length, h = np.full(count, 1 / count), 1 / count, 1e-3
     motion = Motion(
         name=name,
         problem=lambda: ej.problems.chain(count),
@@ -359,9 +353,8 @@ def _works() -> list[Work]:
         _in_euler_parameters(5),
         _mechanism("arm-4", space.arm, 1000, Bars(), is_open=True),
         *(
-            # It is explicit in the forces: longer chains need shorter steps.
-            _points(f"rattle-{count}", count, 1000, Bars(us=us), scheme="Rattle()", h=h)
-            for count, h, us in ((8, 1e-3, 0.6), (64, 1e-4, 3.5), (512, 5e-5, 30.0))
+            _points(f"rattle-{count}", count, steps, Bars(us=us), "Rattle()")
+            for count, steps, us in ((8, 1000, 0.6), (64, 500, 3.5), (512, 200, 30.0))
         ),
         _top("rattle-top", "Rattle()", Bars()),
     ]

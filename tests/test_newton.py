@@ -1,10 +1,9 @@
 """When a search by Newton's method ends, on equations whose root is known."""
 
-import jax
 import jax.numpy as jnp
 import pytest
 
-from enerjax._solvers import find_root, largest, Newton
+from enerjax._solvers import find_root, Newton
 
 from .helpers import EPS
 
@@ -41,14 +40,3 @@ def test_a_correction_that_is_small_by_coincidence_is_not_the_last():
 
     # Beside it, the first correction leads to the root but for 1e-9.
     assert root_of(fn, 1 - b / 2 + 5e-8) == pytest.approx(1, rel=0, abs=10 * EPS)
-
-
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_the_largest_entry_is_infinite_where_one_is_no_number(dtype):
-    largest_of = lambda *x: float(jax.jit(largest)(jnp.array(x, dtype)))
-    assert largest_of() == 0.0
-    assert largest_of(-0.0, 0.0) == 0.0
-    assert largest_of(0.5, -2.0, 1.0) == 2.0
-    assert largest_of(1.0, -jnp.inf) == jnp.inf
-    assert largest_of(1.0, jnp.nan, -3.0) == jnp.inf
-    assert largest_of(-jnp.nan) == jnp.inf

@@ -15,7 +15,7 @@ class Newton(eqx.Module):
     """Newton's method, which solves the scaled step equations to round-off.
 
     **Chord method.** A search begins with it if the scheme offers it: the energy schemes do
-    for systems with constant inertia and more than 8 unknowns in a step. Its
+    for systems with constant inertia and more than 16 unknowns in a step. Its
     approximate Jacobian contains the inertia and the constraint gradients in the middle of
     the step, and no stiffness. It is factorised once. If it does not reduce the residual
     quickly (stiff forces, fast rotations), the exact Jacobian is used.

@@ -141,7 +141,8 @@ def _by_chord(
         return joined(unmerged(lambda x: leaves_of(fn(unravel(x), args)))(x))
 
     def solve(right: Array) -> Array:
-        return joined(leaves_of(chord.correct(unravel(right), args, prepared)))
+        correct = lambda x: leaves_of(chord.correct(unravel(x), args, prepared))
+        return joined(unmerged(correct)(right))
 
     last = chord_iterations(value, solve, newton, start, guess)
     return Root(

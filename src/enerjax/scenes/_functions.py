@@ -25,6 +25,8 @@ def make_system(layout: Layout, over_constrained: bool, row_names: Sequence[str]
     """The system of a scene; its `args` are `Parameters`."""
     names = [(body, kind.names) for body, kind in layout.bodies]
     q, v = ([f"{body}.{x}" for body, own in names for x in own[k]] for k in (0, 1))
+    q += [f"{link.name}.value" for link in layout.inerters]
+    v += [f"{link.name}.rate" for link in layout.inerters]
     redundant = any(group.kind.num_redundant for group in layout.body_groups)
     return System(
         eqx.Partial(kinetic, layout),

@@ -38,8 +38,8 @@ _FEW = 8
 NAME = "enerjax_one_function"
 _OTHERS = frozenset(
     """
-    bitcast_convert_type custom_vmap_call empty2 iota name optimization_barrier
-    platform_index stop_gradient xla_metadata_value
+    custom_vmap_call empty2 iota name optimization_barrier platform_index stop_gradient
+    xla_metadata_value
     """.split()
 )
 POSSIBLE = (

@@ -1,21 +1,14 @@
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..._types import Scalar
 
 
-_WHOLE = {4: jnp.int32, 8: jnp.int64}
-
-
 def largest(x: Array) -> Scalar:
     """The largest absolute value; infinite if an entry is NaN.
 
-    Numbers that are not negative are ordered as the whole numbers with the same bits, and
-    NaN is above all of them. XLA's maximum of floating-point numbers takes them one after
-    the other on CPUs, at three times the cost, and ignores NaN in large arrays (jaxlib
-    0.10), so that a failed solve would be reported as successful.
+    A plain maximum is not sufficient, because on CPUs reductions of large arrays ignore NaN
+    (jaxlib 0.10), and a failed solve would be reported as successful.
     """
-    bits = jax.lax.bitcast_convert_type(jnp.abs(x), _WHOLE[x.dtype.itemsize])
-    found = jax.lax.bitcast_convert_type(jnp.max(bits, initial=0), x.dtype)
-    return jnp.where(jnp.isnan(found), jnp.inf, found)
+    sizes = jnp.abs(x)
+    return jnp.max(jnp.where(jnp.isnan(sizes), jnp.inf, sizes), initial=0.0)
