@@ -76,7 +76,7 @@ class Page:
 @contextlib.contextmanager
 def open_page(file, folder, size):
     """A page with a file, in a window of this size; `folder` is for the browser's own."""
-    from websockets.sync.client import connect
+    from websockets.sync.client import connect  # pyright: ignore
 
     window = f"--window-size={size[0]},{size[1]}"
     command = [CHROMIUM, *FLAGS, window, f"--user-data-dir={folder}", "about:blank"]

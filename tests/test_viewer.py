@@ -22,8 +22,8 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
 def contents(recording):
     """The messages of a page, as pairs of a time and a message, and its duration."""
-    import msgspec
-    import zstandard
+    import msgspec  # pyright: ignore
+    import zstandard  # pyright: ignore
 
     found = re.search(r'__VISER_EMBED_DATA__="([^"]+)"', recording.page)
     packed = base64.b64decode(found.group(1))[8:]  # pyright: ignore
