@@ -148,7 +148,7 @@ FAULTS = (
     ),
     Fault(
         "reactions: torque about the mass centre",
-        "scenes/_relative_motions.py",
+        "scenes/_reactions.py",
         "    pivot = pivot_of(b, numbers)\n",
         "    pivot = b.origin\n",
         "The torque of a joint is that about the mass centre of its second body.",
@@ -156,7 +156,7 @@ FAULTS = (
     ),
     Fault(
         "gaps: an arc in another unit",
-        "scenes/_gaps.py",
+        "scenes/_closure_errors.py",
         "turn / size",
         "turn * size",
         "A gap in an angle is measured in the wrong unit.",

@@ -75,7 +75,7 @@ FAULTS = (
     ),
     Fault(
         "eigenvectors: three sweeps",
-        "_solvers/linear/symmetric.py",
+        "_solvers/linear/cholesky_eigh.py",
         "_SWEEPS = 15",
         "_SWEEPS = 3",
         "Eigenvalues of symmetric matrices are not converged.",
@@ -83,7 +83,7 @@ FAULTS = (
     ),
     Fault(
         "cholesky: derivative of the diagonal",
-        "_solvers/linear/symmetric.py",
+        "_solvers/linear/cholesky_eigh.py",
         "half = 0.5 * jnp.eye(",
         "half = jnp.eye(",
         "Derivatives of the root of the inertia are wrong on its diagonal.",
@@ -133,7 +133,7 @@ FAULTS = (
     ),
     Fault(
         "lanes: all instead of any",
-        "_programs/lanes.py",
+        "_programs/batching.py",
         "jnp.any(flags, axis=0)",
         "jnp.all(flags, axis=0)",
         "What one lane needs is done only where all lanes need it.",
@@ -238,7 +238,7 @@ FAULTS = (
     ),
     Fault(
         "prediction: extrapolation where it is worse",
-        "_run/stage.py",
+        "_run/prediction.py",
         "is_smooth=error(smooth) <= error(last)",
         "is_smooth=error(smooth) >= error(last)",
         "Steps begin from the worse of two guesses.",

@@ -89,7 +89,7 @@ def _left_by_one_correction(scheme, system, start, rng):
     @jax.jit
     def corrected(flat):
         residual = scheme.residual(unravel(flat), problem)
-        matrix = scheme.constraint_matrix(unravel(flat), problem)
+        matrix = scheme.delassus_matrix(unravel(flat), problem)
         correction = scheme.chord(residual, problem, matrix)
         left = scheme.residual(
             jax.tree.map(jnp.subtract, unravel(flat), correction), problem

@@ -155,7 +155,7 @@ def test_schemes_know_no_solver():
     ("source", "name"),
     [
         ("from .._solvers import inverse", "inverse"),
-        ("from .._solvers.linear.symmetric import eigh as e", "eigh"),
+        ("from .._solvers.linear.cholesky_eigh import eigh as e", "eigh"),
         ("def late():\n    from .._solvers import cholesky", "cholesky"),
         ("from .._operators.separable import product", "product"),
         ("from .. import _solvers", "*"),

@@ -12,8 +12,8 @@ from scipy.sparse import csr_array
 
 import enerjax as ej
 from enerjax._programs.sparsity.pattern import jacobian_pattern
-from enerjax._solvers.linear.banded import Band
 from enerjax._solvers.linear.block_diagonal import BlockDiagonal, hessian, inverse_of
+from enerjax._solvers.linear.block_tridiagonal import Band
 from enerjax._solvers.linear.jacobian import Dense, RowPattern
 
 from .helpers import EPS, SCHEMES

@@ -10,8 +10,8 @@ import pytest
 from jax.ad_checkpoint import checkpoint_name
 
 from enerjax._programs import in_one_function, unmerged
+from enerjax._programs.jaxprs import programs_within
 from enerjax._programs.one_function import marks, possible
-from enerjax._programs.tracing import programs_within
 from enerjax._solvers.linear.dense import Inverse
 
 

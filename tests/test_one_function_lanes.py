@@ -7,7 +7,7 @@ import pytest
 
 import enerjax as ej
 from enerjax._programs import in_one_function
-from enerjax._programs.tracing import programs_within
+from enerjax._programs.jaxprs import programs_within
 from enerjax._solvers import eigh, find_root, Newton
 
 from .helpers import long

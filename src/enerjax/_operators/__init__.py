@@ -2,7 +2,7 @@ from .._system import AbstractCanonicalSystem, AbstractSystem, State, System
 from .._types import Args
 from .base import AbstractModel as AbstractModel, Reaction as Reaction
 from .canonical import CanonicalModel as CanonicalModel
-from .constraint_matrix import ConstraintMatrix as ConstraintMatrix
+from .delassus import DelassusMatrix as DelassusMatrix
 from .interval import Gradient as Gradient, Increment as Increment, Time as Time
 from .scaling import (
     local_error as local_error,

@@ -42,7 +42,7 @@ from .._types import (
     Scalar,
     Velocities,
 )
-from .constraint_matrix import ConstraintMatrix
+from .delassus import DelassusMatrix
 from .interval import Gradient, Increment, Scales, Time, time_rate
 
 
@@ -71,8 +71,8 @@ class AbstractModel(eqx.Module):
 
     @property
     @abc.abstractmethod
-    def has_constraint_matrix(self) -> bool:
-        """Whether the chord method can be used, so that `constraint_matrix` exists."""
+    def has_delassus_matrix(self) -> bool:
+        """Whether the chord method can be used, so that `delassus_matrix` exists."""
 
     @property
     @abc.abstractmethod
@@ -245,8 +245,8 @@ class AbstractModel(eqx.Module):
         """
 
     @abc.abstractmethod
-    def constraint_matrix(self, q: Coordinates, t: Time) -> ConstraintMatrix:
-        """`B M^-1 B^T` at a position. It exists only if `has_constraint_matrix`."""
+    def delassus_matrix(self, q: Coordinates, t: Time) -> DelassusMatrix:
+        """`B M^-1 B^T` at a position. It exists only if `has_delassus_matrix`."""
 
     @abc.abstractmethod
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:

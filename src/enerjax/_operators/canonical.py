@@ -14,7 +14,7 @@ from .._solvers import affine_root, as_dense, Symmetric
 from .._system import AbstractCanonicalSystem, State
 from .._types import Args, Coordinates, JointMultipliers, Multipliers, Scalar, Velocities
 from .base import AbstractModel, Reaction
-from .constraint_matrix import ConstraintMatrix
+from .delassus import DelassusMatrix
 from .interval import Gradient, gradient_and_work, Increment, Scales, Time, time_rate
 
 
@@ -220,10 +220,10 @@ class CanonicalModel(AbstractModel):
         return Gradient(force, rate / h, power)
 
     @property
-    def has_constraint_matrix(self) -> bool:
+    def has_delassus_matrix(self) -> bool:
         return False
 
-    def constraint_matrix(self, q: Coordinates, t: Time) -> ConstraintMatrix:
+    def delassus_matrix(self, q: Coordinates, t: Time) -> DelassusMatrix:
         raise NotImplementedError
 
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:

@@ -53,7 +53,7 @@ from .._types import (
     Velocities,
 )
 from .base import AbstractModel, Position, Reaction
-from .constraint_matrix import ConstraintMatrix
+from .delassus import DelassusMatrix
 from .elements import (
     element_energies,
     gradient_and_work_by_rows,
@@ -78,7 +78,7 @@ class SeparableModel(AbstractModel):
     # Whether the potential is linear; always false for small systems.
     has_linear_potential: bool = eqx.field(static=True)
     kinematics: AbstractKinematics
-    # The index tables of `constraint_matrix`; `None` where there is none.
+    # The index tables of `delassus_matrix`; `None` where there is none.
     constraint_tables: SchurTables | None = eqx.field(static=True)
     # The model without rotations, if this one has some.
     without_rotations: "SeparableModel | None"
@@ -381,16 +381,16 @@ class SeparableModel(AbstractModel):
         return Gradient(h * force, dv[:0], power)
 
     @property
-    def has_constraint_matrix(self) -> bool:
+    def has_delassus_matrix(self) -> bool:
         return self.constraint_tables is not None
 
-    def constraint_matrix(self, q: Coordinates, t: Time) -> ConstraintMatrix:
+    def delassus_matrix(self, q: Coordinates, t: Time) -> DelassusMatrix:
         assert self.constraint_tables is not None
         frames = self._frames(q)
         rates, weight = self._rates_of_joints(q, t, frames), self._weight()
         rest = jnp.zeros((weight.shape[0],), q.dtype)
         rows = schur(self.constraint_tables, rates, rest, weight)
-        return ConstraintMatrix(self.inverse_inertia, rows, frames)
+        return DelassusMatrix(self.inverse_inertia, rows, frames)
 
     def _frames(self, q: Coordinates) -> Frames | None:
         """`L` stacked on `B_c`, where coordinates are redundant."""

@@ -1,6 +1,7 @@
 """Programs of JAX: tracing, sparsity, rewriting, and compiling into one function."""
 
 from . import primitives as primitives
+from .batching import in_any_lane as in_any_lane
 from .compiled import (
     at_top_level as at_top_level,
     compiled as compiled,
@@ -10,7 +11,15 @@ from .counting import num_operations as num_operations
 from .digest import checksum as checksum, digest as digest
 from .fast_loops import enable_fast_loops as enable_fast_loops
 from .hashable_indices import Indices as Indices
-from .lanes import in_any_lane as in_any_lane
+from .jaxprs import (
+    evaluate as evaluate,
+    function_with_own_derivative as function_with_own_derivative,
+    interpret as interpret,
+    is_known as is_known,
+    name_of as name_of,
+    programs_within as programs_within,
+    wrapped_program as wrapped_program,
+)
 from .one_function.api import in_one_function as in_one_function, unmerged as unmerged
 from .one_function.obstacles import why_not_one_function as why_not_one_function
 from .one_function.possible import LARGEST_SUM as LARGEST_SUM
@@ -24,13 +33,4 @@ from .sparsity.pattern import (
     jacobian_pattern as jacobian_pattern,
     LARGE as LARGE,
     shape_of as shape_of,
-)
-from .tracing import (
-    evaluate as evaluate,
-    function_with_own_derivative as function_with_own_derivative,
-    interpret as interpret,
-    is_known as is_known,
-    name_of as name_of,
-    programs_within as programs_within,
-    wrapped_program as wrapped_program,
 )

@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array, PyTree
 
-from .tracing import is_known
+from .jaxprs import is_known
 
 
 # XLA's CPU back end has two generators of code for merged operations. The newer one, which

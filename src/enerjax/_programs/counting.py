@@ -7,8 +7,8 @@ from typing import Any
 import jax
 from jaxtyping import Array, PyTree
 
+from .jaxprs import programs_within
 from .primitives import CONTRACTION, DATA_MOVEMENT, REDUCTIONS
-from .tracing import programs_within
 
 
 def num_equations(jaxpr: Any) -> int:

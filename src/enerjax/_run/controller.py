@@ -165,10 +165,12 @@ class _ControlledPlan(AbstractPlan):
         return jnp.where(last, 1.0, place + length), length
 
     def warm(self, memory: _Memory, warm: Warm, length: Scalar) -> Warm:
-        return for_length(warm, self.stages, memory.before, length)
+        stages = for_length(warm.stages, self.stages, memory.before, length)
+        return eqx.tree_at(lambda warm: warm.stages, warm, stages)
 
     def kept(self, new: Warm, old: Warm) -> Warm:
-        return with_history(new, old)
+        stages = with_history(new.stages, old.stages)
+        return eqx.tree_at(lambda warm: warm.stages, new, stages)
 
     def judge(
         self,

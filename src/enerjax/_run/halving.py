@@ -22,7 +22,8 @@ from .._solvers import RootFinder, SMALL
 from .._system import State
 from .._types import Count, Flag, Scalar
 from ..schemes import AbstractOneSolveScheme, AbstractSchemeWithMemory, StepEnd
-from .stage import first_memory, Memory, num_unknowns, solve, Solved, unsolved
+from .prediction import Memory
+from .stage import first_memory, num_unknowns, solve, Solved, unsolved
 
 
 # The default for large systems: their steps take far longer than compiling the division.

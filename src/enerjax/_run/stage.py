@@ -22,7 +22,6 @@ from .._solvers import (
     Chord,
     find_root,
     kept_factors,
-    max_norm,
     Root,
     RootFinder,
     RowPattern,
@@ -35,39 +34,14 @@ from ..schemes import (
     AbstractSchemeWithMemory,
     StepEnd,
 )
+from .prediction import extrapolated, Memory, memory_after, predicted
 
 
 # Enough for the linear convergence of a step that locks. A step that needs more has failed.
 MAX_ITERATIONS = 50
-# The number of steps without the chord method after it has failed. The causes of a failure
-# (stiff forces, fast rotations) usually last for several steps, and each attempt costs a
-# few evaluations of the residual.
-_CHORD_WAITS = 10
 # Up to this number of unknowns Newton's method is about as fast as the chord method in
 # short steps, and faster in long ones, where the chord method needs more corrections.
 _FEW = 16
-
-
-class Memory(eqx.Module):
-    """The data of the last steps that a solve uses.
-
-    - `added`: the unknowns of the last three steps minus those of a free flight, newest
-      first.
-    - `is_smooth`: whether the extrapolation of `added` was a better guess for the last step
-      than the step before it.
-    - `factors`: the factors of the Jacobians of the last three steps, newest first; `None`
-      for large systems, and where the chord method is used.
-    - `chord_wait`: the number of steps until the chord method is tried again; `None` where
-      the equations have no chord method.
-    - `carried`: the data that a scheme with a memory passes to its next step; `None` for
-      other schemes.
-    """
-
-    added: PyTree[Any]
-    is_smooth: Flag
-    factors: AbstractFactors | None
-    chord_wait: Count | None
-    carried: PyTree[Any]
 
 
 class Solved(eqx.Module):
@@ -111,7 +85,7 @@ def first_memory(
     has_chord = (
         flat.size > _FEW
         and isinstance(scheme, AbstractSchemeWithChord)
-        and model.has_constraint_matrix
+        and model.has_delassus_matrix
     )
     factors = None if has_chord else kept_factors(flat.size, flat.dtype)
     return Memory(
@@ -227,11 +201,11 @@ def _prepared(
         unknown_scale=unknown_scale,
         row_scale=row_scale,
         least=least,
-        guess=scaled(jax.tree.map(jnp.add, flight, _predicted(memory))),
+        guess=scaled(jax.tree.map(jnp.add, flight, predicted(memory))),
         # The extrapolated guess can lie beyond a fold of the step equations. A free flight
         # usually does not, and a fraction of it does not if bodies rotate far in a step.
         others=tuple(scaled(shortened(flight, part)) for part in (1.0, 0.5, 0.25)),
-        factors=jax.tree.map(_extrapolated, memory.factors),
+        factors=jax.tree.map(extrapolated, memory.factors),
     )
 
 
@@ -263,7 +237,7 @@ def _solved(
         residual=root.residual,
         result=first_failure(first_failure(end.result, found), branch),
         roughness=roughness(*sizes),
-        memory=_memory_after(memory, added, prepared.unknown_scale, root, end.carried),
+        memory=memory_after(memory, added, prepared.unknown_scale, root, end.carried),
     )
 
 
@@ -274,7 +248,7 @@ def _chord(scheme: AbstractOneSolveScheme) -> Chord:
     def prepare(x, inputs):
         scheme, problem, unknown_scale, _ = inputs
         z = jax.tree.map(jnp.multiply, x, unknown_scale)
-        return scheme.constraint_matrix(z, problem)
+        return scheme.delassus_matrix(z, problem)
 
     def correct(value, inputs, matrix):
         scheme, problem, unknown_scale, row_scale = inputs
@@ -288,64 +262,6 @@ def _chord(scheme: AbstractOneSolveScheme) -> Chord:
 def num_unknowns(memory: Memory) -> int:
     """The number of unknowns of a solve."""
     return sum(x[0].size for x in jax.tree.leaves(memory.added))
-
-
-def _predicted(memory: Memory) -> PyTree[Any]:
-    """The predicted difference between the unknowns of a step and those of a free flight.
-
-    For a smooth motion this is an extrapolation of the last three steps, and for one that
-    changes quickly it is the difference of the last step. The choice is the one that would
-    have been better for the last step.
-    """
-    smooth, last = _candidates(memory)
-    choose = lambda x, y: jnp.where(memory.is_smooth, x, y)
-    return jax.tree.map(choose, smooth, last)
-
-
-def _candidates(memory: Memory) -> tuple[PyTree[Any], PyTree[Any]]:
-    """The two predictions: the extrapolation, and the difference of the last step."""
-    smooth = jax.tree.map(_extrapolated, memory.added)
-    return smooth, jax.tree.map(lambda x: x[0], memory.added)
-
-
-def _memory_after(
-    memory: Memory,
-    added: PyTree[Any],
-    unknown_scale: PyTree[Any],
-    root: Root,
-    carried: PyTree[Any],
-) -> Memory:
-    """The memory after a step whose difference from a free flight is `added`."""
-
-    def error(guess: PyTree[Any]) -> Scalar:
-        difference = lambda x, y, unit: (x - y) / unit
-        return max_norm(jax.tree.map(difference, added, guess, unknown_scale))
-
-    smooth, last = _candidates(memory)
-    return Memory(
-        added=jax.tree.map(_shifted, added, memory.added),
-        is_smooth=error(smooth) <= error(last),
-        factors=jax.tree.map(_shifted, root.factors, memory.factors),
-        chord_wait=_wait_after(memory.chord_wait, root),
-        carried=carried,
-    )
-
-
-def _wait_after(wait: Count | None, root: Root) -> Count | None:
-    if wait is None:
-        return None
-    passed = jnp.where(root.by_chord, 0, _CHORD_WAITS)
-    return jnp.where(wait == 0, passed, wait - 1).astype(wait.dtype)
-
-
-def _extrapolated(x: Array) -> Array:
-    """The quadratic extrapolation of the last three values, which are newest first."""
-    return 3 * x[0] - 3 * x[1] + x[2]
-
-
-def _shifted(new: Array, old: Array) -> Array:
-    """The last three values after a step with the value `new`."""
-    return jnp.stack([new, old[0], old[1]])
 
 
 def _gradients_reverse(model: AbstractModel, a: State, b: State) -> Flag:

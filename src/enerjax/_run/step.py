@@ -16,7 +16,8 @@ from .._types import Args, Coordinates, Count, Flag, Multipliers, Real, Scalar, 
 from ..schemes import AbstractScheme, AbstractSchemeWithRotations, Energies
 from .halving import solve_or_divide
 from .inputs import check_halvings, prepare
-from .stage import first_memory, Memory
+from .prediction import Memory
+from .stage import first_memory
 
 
 class Warm(eqx.Module):

@@ -11,6 +11,7 @@ from .linear.block_diagonal import (
     padded as padded,
     Symmetric as Symmetric,
 )
+from .linear.cholesky_eigh import cholesky as cholesky, eigh as eigh
 from .linear.dense import (
     AbstractFactors as AbstractFactors,
     inverse as inverse,
@@ -38,7 +39,6 @@ from .linear.schur import (
     schur_tables as schur_tables,
     SchurTables as SchurTables,
 )
-from .linear.symmetric import cholesky as cholesky, eigh as eigh
 from .linear.user_solver import (
     AbstractSparseSolver as AbstractSparseSolver,
     KLU as KLU,

@@ -8,9 +8,9 @@ from . import (
     shapes as shapes,
 )
 from ._body_coordinates import quaternion_rates as quaternion_rates, rotation as rotation
+from ._closure_errors import Gap as Gap
 from ._ends import Ends as Ends
 from ._frames import Frame as Frame
-from ._gaps import Gap as Gap
 from ._importing import from_mjcf as from_mjcf, from_urdf as from_urdf
 from ._laws import (
     AbstractConstraintLaw as AbstractConstraintLaw,
@@ -33,6 +33,6 @@ from ._motion import (
     Motion as Motion,
 )
 from ._parameters import Parameters as Parameters
+from ._reactions import Reaction as Reaction
 from ._readouts import Readout as Readout
-from ._relative_motions import Reaction as Reaction
 from .scene import Scene as Scene

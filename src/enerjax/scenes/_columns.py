@@ -10,12 +10,12 @@ from jaxtyping import Array, Float
 
 from .._programs import compiled
 from ._body_coordinates import AXES
-from ._feedback import measures_of, Moving
 from ._frames import GROUND
 from ._layout import Layout
+from ._motion_view import measures_of, Moving
 from ._parameters import Parameters
+from ._reactions import each, Reaction
 from ._readouts import Readout
-from ._relative_motions import each, Reaction
 from ._rotations import quaternion_of
 
 

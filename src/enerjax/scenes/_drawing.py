@@ -22,7 +22,7 @@ from .._pictures import (
 )
 from ._frames import GROUND
 from ._motion import Array, Motion
-from ._relative_motions import Reaction
+from ._reactions import Reaction
 from ._sketch import Sketch
 
 

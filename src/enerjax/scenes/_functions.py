@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 
 from .._system import Names, RigidBodies, System
 from .._types import Coordinates, Multipliers, Scalar, Velocities
-from ._feedback import Moving
 from ._laws import AbstractForceLaw, Acting, Driven
 from ._layout import Layout, Links
+from ._motion_view import Moving
 from ._parameters import Parameters
 from ._pose_view import evaluate, lift, rows, View
 from ._user_functions import ask, vector_of

@@ -10,13 +10,13 @@ from .._analysis import ConsistentStart, Equilibrium
 from .._programs import compiled
 from .._system import State
 from .._types import Real, Scalar
-from ._feedback import link_of, measure_of, Moving
 from ._functions import at_time, pushes
 from ._laws import AbstractForceLaw, AbstractSpringLaw, Driven, Flywheel, Length
 from ._layout import Layout
 from ._measures import AbstractTurn
+from ._motion_view import link_of, measure_of, Moving
 from ._parameters import Parameters
-from ._relative_motions import each
+from ._reactions import each
 
 
 class Readout(NamedTuple):

@@ -11,14 +11,14 @@ from .._analysis import start_near
 from .._programs import is_known
 from .._system import State, System
 from .._types import Real
-from ._constraint_rows import first_dependent
+from ._closure_errors import by_name, Measured, measured
 from ._functions import drives_at
-from ._gaps import by_name, Measured, measured
 from ._laws import Driven, Missed
 from ._layout import Layout
 from ._measures import AbstractTurn
 from ._parameters import Parameters
 from ._pose_view import evaluate, lift, View
+from ._row_index import first_dependent
 
 
 # A gap that is larger than this fraction of the bodies, or of their speed, is a mistake;

@@ -13,19 +13,19 @@ from .._programs import is_known
 from .._run import Solution
 from .._system import State, System
 from .._types import Coordinates, Real, Vector
+from ._closure_errors import Gap, Measured
 from ._columns import of_bodies, of_reaction, of_readout
 from ._compile import compile_parts, LINKS, sort_parts, start_of
-from ._constraint_rows import check_reacting, row_names, rows_of
 from ._default_shapes import all_shapes, given_shapes
-from ._feedback import measures_of, Moving
 from ._functions import make_system
-from ._gaps import Gap, Measured
 from ._law_checks import check_laws
 from ._motion import Motion, motion_of, numbers_by_name, Parts, states_of
+from ._motion_view import measures_of, Moving
 from ._parameters import Parameters
 from ._pose_view import View
+from ._reactions import each, Reaction, reaction
 from ._readouts import measured_along, Readout
-from ._relative_motions import each, Reaction, reaction
+from ._row_index import check_reacting, row_names, rows_of
 from ._start import check_poses, closed_start, gaps_of, PartialStart
 from ._summary import summary
 from .bodies import AbstractBody

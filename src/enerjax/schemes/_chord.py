@@ -10,59 +10,57 @@ components of the balance of momentum.
 
 import jax.numpy as jnp
 
-from .._operators import ConstraintMatrix, Increment
+from .._operators import DelassusMatrix, Increment
 from .._types import Scalar
 from ._discontinuous import JumpAndEnd
 
 
-def step_chord(rows: Increment, constraints: ConstraintMatrix) -> Increment:
+def step_chord(rows: Increment, delassus: DelassusMatrix) -> Increment:
     """The correction of a step with `v1 = 2 (rate - M^-1 C^T eta) - v0`; it solves
 
     2 M rate + C^T (impulse - 2 eta) = r_m
     C rate = r_phi,   2 C rate - 2 G eta = r_psi
     """
-    reduced = constraints.reduced(rows)
+    reduced = delassus.reduced(rows)
     inner = reduced.rows
-    free = 0.5 * (constraints.inverse_inertia @ inner.rate)
-    impulse = constraints.product(free) - inner.impulse
+    free = 0.5 * (delassus.inverse_inertia @ inner.rate)
+    impulse = delassus.product(free) - inner.impulse
     if inner.velocity_impulse.size == 0:
-        (impulse,) = constraints.solve(impulse[None])
+        (impulse,) = delassus.solve(impulse[None])
         reaction = inner.velocity_impulse
         both = impulse
     else:
         right = jnp.stack([impulse, inner.impulse - 0.5 * inner.velocity_impulse])
-        impulse, reaction = constraints.solve(right)
+        impulse, reaction = delassus.solve(right)
         both = impulse + reaction
-    relations = reduced.normal - constraints.normal_forces(2 * both)
+    relations = reduced.normal - delassus.normal_forces(2 * both)
     return Increment(
         impulse=jnp.concatenate([2 * both, relations]),
-        rate=constraints.rates(free - constraints.velocity(impulse), reduced),
+        rate=delassus.rates(free - delassus.velocity(impulse), reduced),
         momentum=rows.momentum,
         velocity_impulse=reaction,
     )
 
 
-def rattle_chord(rows: Increment, constraints: ConstraintMatrix) -> Increment:
+def rattle_chord(rows: Increment, delassus: DelassusMatrix) -> Increment:
     """The correction of a step of RATTLE, whose coordinates are not redundant; it solves
 
     M rate + C^T impulse / 2 = r_m
     C rate = r_phi,   C rate - G velocity_impulse / 2 = r_psi
     """
-    free = constraints.inverse_inertia @ rows.rate
-    before = constraints.product(free) - rows.impulse
+    free = delassus.inverse_inertia @ rows.rate
+    before = delassus.product(free) - rows.impulse
     right = jnp.stack([before, rows.impulse - rows.velocity_impulse])
-    before, after = constraints.solve(right)
+    before, after = delassus.solve(right)
     return Increment(
         impulse=2 * before,
-        rate=free - constraints.velocity(before),
+        rate=free - delassus.velocity(before),
         momentum=rows.momentum,
         velocity_impulse=2 * after,
     )
 
 
-def jump_chord(
-    alpha: Scalar, rows: JumpAndEnd, constraints: ConstraintMatrix
-) -> JumpAndEnd:
+def jump_chord(alpha: Scalar, rows: JumpAndEnd, delassus: DelassusMatrix) -> JumpAndEnd:
     """The correction of a discontinuous step, whose velocities `vj` and `v1` satisfy
 
         vj + v1 = 2 (rate_1 - M^-1 C^T eta_1)
@@ -72,40 +70,40 @@ def jump_chord(
     with the rows of the constraints at both nodes.
     """
     alpha = alpha.astype(rows.end.rate.dtype)
-    of_jump, of_end = constraints.reduced(rows.jump), constraints.reduced(rows.end)
+    of_jump, of_end = delassus.reduced(rows.jump), delassus.reduced(rows.end)
     jump, end = of_jump.rows, of_end.rows
-    v1, vj = (constraints.inverse_inertia @ x for x in (end.rate, jump.rate))
+    v1, vj = (delassus.inverse_inertia @ x for x in (end.rate, jump.rate))
     is_ggl = end.velocity_impulse.size > 0
     s1, sj = (x.velocity_impulse for x in (end, jump))
     if not is_ggl:
         # Without velocity constraints, those of the positions determine both velocities.
         sj = (2 * end.impulse + 6 * jump.impulse) / (1 + alpha)
         s1 = 2 * end.impulse - sj
-    right = [constraints.product(v1) - s1, 3 * (sj - constraints.product(vj))]
+    right = [delassus.product(v1) - s1, 3 * (sj - delassus.product(vj))]
     if is_ggl:
         right.append(end.impulse - 0.5 * (s1 + sj))
         right.append(end.impulse + 3 * jump.impulse - 0.5 * (1 + alpha) * sj)
-    after, before, *reactions = constraints.solve(jnp.stack(right))
-    v1 = v1 - constraints.velocity(after)
-    vj = vj + constraints.velocity(before) / 3
+    after, before, *reactions = delassus.solve(jnp.stack(right))
+    v1 = v1 - delassus.velocity(after)
+    vj = vj + delassus.velocity(before) / 3
     rate = 0.5 * (v1 + vj)
     jump_rate = (1 + alpha) * vj
     eta_1, eta_j = reactions if is_ggl else (end.velocity_impulse, jump.velocity_impulse)
     if is_ggl:
-        rate = rate + constraints.velocity(eta_1)
-        jump_rate = jump_rate + 2 * constraints.velocity(eta_j)
-    relations = of_end.normal - constraints.normal_forces(after)
-    difference = -3 * of_jump.normal - constraints.normal_forces(before)
+        rate = rate + delassus.velocity(eta_1)
+        jump_rate = jump_rate + 2 * delassus.velocity(eta_j)
+    relations = of_end.normal - delassus.normal_forces(after)
+    difference = -3 * of_jump.normal - delassus.normal_forces(before)
     return JumpAndEnd(
         jump=Increment(
             impulse=jnp.concatenate([after - before, relations - difference]),
-            rate=constraints.rates((jump_rate - 2 * rate) / 6, of_jump),
+            rate=delassus.rates((jump_rate - 2 * rate) / 6, of_jump),
             momentum=rows.jump.momentum,
             velocity_impulse=eta_j,
         ),
         end=Increment(
             impulse=jnp.concatenate([after, relations]),
-            rate=constraints.rates(rate, of_end),
+            rate=delassus.rates(rate, of_end),
             momentum=rows.end.momentum,
             velocity_impulse=eta_1,
         ),

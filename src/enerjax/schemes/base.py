@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PyTree
 from .._discrete import AbstractDerivative, ChainRule
 from .._operators import (
     AbstractModel,
-    ConstraintMatrix,
+    DelassusMatrix,
     Gradient,
     Increment,
     Reaction,
@@ -226,10 +226,10 @@ class StepProblem(eqx.Module):
             return jnp.zeros((0,), state.q.dtype)
         return self.model.joint_rate(state.q, state.v, state.t)
 
-    def constraint_matrix(self, end: Increment) -> ConstraintMatrix:
-        """`B M^-1 B^T` in the middle of the step to `end`."""
+    def delassus_matrix(self, end: Increment) -> DelassusMatrix:
+        """The Delassus matrix in the middle of the step to `end`."""
         middle = 0.5 * (self.start.q + self.position(end))
-        return self.model.constraint_matrix(middle, self.middle_time)
+        return self.model.delassus_matrix(middle, self.middle_time)
 
     def rows(self, z: Increment, state: State, gradient: Gradient) -> Increment:
         """The equations of one node: those of motion, and the constraints at the node."""
@@ -383,16 +383,16 @@ class AbstractSchemeWithChord(AbstractOneSolveScheme[Z, P], Generic[Z, P]):
     The approximate Jacobian contains the inertia and the gradients of the constraints. It
     differs from the exact one by terms of relative size `h^2` times stiffness divided by
     inertia. Where these are small, the chord method with this matrix converges quickly, and
-    its linear systems have the matrix `B M^-1 B^T`. It is tried first for systems with
-    constant inertia. Where it fails, the exact Jacobian is used.
+    its linear systems have the Delassus matrix `B M^-1 B^T`. It is tried first for systems
+    with constant inertia. Where it fails, the exact Jacobian is used.
     """
 
     @abc.abstractmethod
-    def constraint_matrix(self, z: Z, problem: P) -> ConstraintMatrix:
-        """The matrix of the constraints in the middle of the step that `z` describes."""
+    def delassus_matrix(self, z: Z, problem: P) -> DelassusMatrix:
+        """The Delassus matrix in the middle of the step that `z` describes."""
 
     @abc.abstractmethod
-    def chord(self, rows: Z, problem: P, constraints: ConstraintMatrix) -> Z:
+    def chord(self, rows: Z, problem: P, delassus: DelassusMatrix) -> Z:
         """The unknowns `x` that solve `J x = rows` with the approximate Jacobian `J`."""
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._discrete import AbstractDerivative, MeanValue
-from .._operators import AbstractModel, ConstraintMatrix, Gradient, Increment, Reaction
+from .._operators import AbstractModel, DelassusMatrix, Gradient, Increment, Reaction
 from .._programs import is_known
 from .._solvers import Assembled
 from .._system import State
@@ -140,26 +140,26 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
         jump_rows = eqx.tree_at(lambda rows: rows.rate, z.jump, row)
         return JumpAndEnd(jump_rows, self._rows(z.end, problem, end, jump))
 
-    def constraint_matrix(self, z: _Unknowns, problem: _Problem) -> ConstraintMatrix:
-        return problem.step.constraint_matrix(_end_of(z))
+    def delassus_matrix(self, z: _Unknowns, problem: _Problem) -> DelassusMatrix:
+        return problem.step.delassus_matrix(_end_of(z))
 
     def chord(
-        self, rows: _Unknowns, problem: _Problem, constraints: ConstraintMatrix
+        self, rows: _Unknowns, problem: _Problem, delassus: DelassusMatrix
     ) -> _Unknowns:
         if not isinstance(rows, JumpAndEnd):
-            return step_chord(rows, constraints)
+            return step_chord(rows, delassus)
         # The velocities at the end of the step are reduced by the unknown jump.
-        jump = constraints.inverse_inertia @ rows.jump.rate
+        jump = delassus.inverse_inertia @ rows.jump.rate
         end = eqx.tree_at(
             lambda end: (end.rate, end.velocity_impulse),
             rows.end,
             (
                 rows.end.rate + rows.jump.rate,
-                rows.end.velocity_impulse + constraints.product(jump),
+                rows.end.velocity_impulse + delassus.product(jump),
             ),
         )
         jumps = eqx.tree_at(lambda rows: rows.rate, rows.jump, jump)
-        return JumpAndEnd(jumps, step_chord(end, constraints))
+        return JumpAndEnd(jumps, step_chord(end, delassus))
 
     def finish(self, z: _Unknowns, problem: _Problem) -> StepEnd:
         step, dissipative, h = problem.step, problem.dissipative, problem.step.h

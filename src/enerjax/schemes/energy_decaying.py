@@ -1,7 +1,7 @@
 import equinox as eqx
 
 from .._discrete import AbstractDerivative, ChainRule
-from .._operators import AbstractModel, ConstraintMatrix, Reaction
+from .._operators import AbstractModel, DelassusMatrix, Reaction
 from .._system import State
 from .._types import Multipliers, Real, Scalar, Velocities
 from ._arguments import (
@@ -114,13 +114,13 @@ class EnergyDecaying(AbstractSchemeWithRotations[JumpAndEnd, StepProblem]):
             end=problem.rows(z.end, end, after),  # eq. (47a)
         )
 
-    def constraint_matrix(self, z: JumpAndEnd, problem: StepProblem) -> ConstraintMatrix:
-        return problem.constraint_matrix(z.end)
+    def delassus_matrix(self, z: JumpAndEnd, problem: StepProblem) -> DelassusMatrix:
+        return problem.delassus_matrix(z.end)
 
     def chord(
-        self, rows: JumpAndEnd, problem: StepProblem, constraints: ConstraintMatrix
+        self, rows: JumpAndEnd, problem: StepProblem, delassus: DelassusMatrix
     ) -> JumpAndEnd:
-        return jump_chord(self.alpha, rows, constraints)
+        return jump_chord(self.alpha, rows, delassus)
 
     def finish(self, z: JumpAndEnd, problem: StepProblem) -> StepEnd:
         jump, end = self._nodes(z, problem)

@@ -2,7 +2,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._discrete import AbstractDerivative, ChainRule
-from .._operators import AbstractModel, ConstraintMatrix, Increment, Reaction
+from .._operators import AbstractModel, DelassusMatrix, Increment, Reaction
 from .._system import State
 from .._types import Multipliers, Scalar, Velocities
 from ._arguments import check_derivative, check_formulation
@@ -68,13 +68,13 @@ class EnergyPreserving(AbstractSchemeWithRotations[Increment, StepProblem]):
         load = problem.step_load(end, z)
         return problem.rows(z, end, gradient.less(load))  # eq. (14a, c)
 
-    def constraint_matrix(self, z: Increment, problem: StepProblem) -> ConstraintMatrix:
-        return problem.constraint_matrix(z)
+    def delassus_matrix(self, z: Increment, problem: StepProblem) -> DelassusMatrix:
+        return problem.delassus_matrix(z)
 
     def chord(
-        self, rows: Increment, problem: StepProblem, constraints: ConstraintMatrix
+        self, rows: Increment, problem: StepProblem, delassus: DelassusMatrix
     ) -> Increment:
-        return step_chord(rows, constraints)
+        return step_chord(rows, delassus)
 
     def finish(self, z: Increment, problem: StepProblem) -> StepEnd:
         end = self._end(z, problem)

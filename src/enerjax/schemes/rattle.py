@@ -1,6 +1,6 @@
 import equinox as eqx
 
-from .._operators import AbstractModel, ConstraintMatrix, Increment
+from .._operators import AbstractModel, DelassusMatrix, Increment
 from .._system import State
 from .._types import Coordinates, Multipliers, Scalar, Velocities
 from ._chord import rattle_chord
@@ -60,13 +60,13 @@ class Rattle(AbstractSchemeWithChord[Increment, StepProblem]):
         balance = problem.separable_model.inertia @ (middle - start.v) + 0.5 * pulled
         return problem.rows_of_balance(balance, self._end(z, problem))
 
-    def constraint_matrix(self, z: Increment, problem: StepProblem) -> ConstraintMatrix:
-        return problem.constraint_matrix(z)
+    def delassus_matrix(self, z: Increment, problem: StepProblem) -> DelassusMatrix:
+        return problem.delassus_matrix(z)
 
     def chord(
-        self, rows: Increment, problem: StepProblem, constraints: ConstraintMatrix
+        self, rows: Increment, problem: StepProblem, delassus: DelassusMatrix
     ) -> Increment:
-        return rattle_chord(rows, constraints)
+        return rattle_chord(rows, delassus)
 
     def finish(self, z: Increment, problem: StepProblem) -> StepEnd:
         end = self._end(z, problem)

@@ -7,6 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax.extend.core import Jaxpr
 
+from ..jaxprs import programs_within
 from ..primitives import (
     CALLS,
     CALLS_OF_OTHER_VERSIONS,
@@ -20,7 +21,6 @@ from ..primitives import (
     REDUCTIONS,
     SCATTERS,
 )
-from ..tracing import programs_within
 
 
 # XLA calls a library for sums of more entries; this limit leaves a margin.

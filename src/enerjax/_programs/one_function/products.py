@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array, PyTree
 
+from ..jaxprs import evaluate, interpret
 from ..primitives import CONTRACTION, JIT
-from ..tracing import evaluate, interpret
 from .possible import LARGEST_SUM
 
 

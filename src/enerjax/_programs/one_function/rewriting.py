@@ -20,8 +20,8 @@ from jax.extend.core import ClosedJaxpr, Literal
 from jax.extend.core.primitives import reduce_sum_p
 from jaxtyping import Array, Int
 
+from ..jaxprs import evaluate, interpret, programs_within, wrapped_program
 from ..primitives import CONTRACTION, SCATTERS
-from ..tracing import evaluate, interpret, programs_within, wrapped_program
 from .possible import is_small_product, LARGEST_SUM, NAME
 from .products import written_out
 

@@ -18,9 +18,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ..jaxprs import evaluate, interpret
 from ..one_function.possible import LARGEST_SUM
 from ..primitives import ARITHMETIC, JIT
-from ..tracing import evaluate, interpret
 from .data_movement import MOVES
 
 

@@ -19,6 +19,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array
 
+from ..jaxprs import evaluate, interpret, is_known, name_of, wrapped_program
 from ..primitives import (
     CONTRACTION,
     CONTROL_FLOW,
@@ -28,7 +29,6 @@ from ..primitives import (
     PIECEWISE_CONSTANT,
     REDUCTIONS,
 )
-from ..tracing import evaluate, interpret, is_known, name_of, wrapped_program
 from .data_movement import MOVES
 
 

@@ -20,7 +20,7 @@ from ..._programs import (
     plain_products,
     shape_of,
 )
-from .banded import Band, coloured_products, column_colours
+from .block_tridiagonal import Band, coloured_products, column_colours
 from .dense import AbstractFactors, Inverse, inverse, LU, SMALL, solve
 from .user_solver import AbstractSparseSolver, LineaxFactors, Sparse
 

@@ -20,8 +20,8 @@ import scipy
 from jaxtyping import Array, Float
 
 from ..._programs import Indices, jacobian_pattern, shape_of, summed, unmerged
-from .banded import block_sizes, coloured_products, column_colours
 from .block_diagonal import BlockDiagonal, Symmetric
+from .block_tridiagonal import block_sizes, coloured_products, column_colours
 from .dense import inverse
 
 

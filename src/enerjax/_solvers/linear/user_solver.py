@@ -15,7 +15,7 @@ import scipy
 from jaxtyping import Array, Float, PyTree
 
 from ..._programs import shape_of
-from .banded import coloured_products, column_colours
+from .block_tridiagonal import coloured_products, column_colours
 from .dense import AbstractFactors
 
 

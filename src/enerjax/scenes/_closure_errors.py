@@ -8,7 +8,6 @@ from jaxtyping import Array, Float
 
 from .._programs import compiled
 from .._types import Coordinates, Scalar
-from ._constraint_rows import members
 from ._frames import Frame, Numbers
 from ._functions import drives_at, inerters_at
 from ._laws import Driven, Flywheel, Length, Missed
@@ -16,7 +15,8 @@ from ._layout import Layout, Links
 from ._measures import Separation, Slide
 from ._parameters import Parameters
 from ._pose_view import evaluate, View
-from ._relative_motions import moved, no_motion, pivot_of
+from ._reactions import moved, no_motion, pivot_of
+from ._row_index import members
 from ._user_functions import vector_of
 
 

@@ -1,4 +1,4 @@
-"""The constraint matrix `G = B M^-1 B^T` of the equations for the multipliers."""
+"""The Delassus matrix `G = B M^-1 B^T`, by which multipliers are found."""
 
 from typing import NamedTuple
 
@@ -25,7 +25,7 @@ class Reduced(NamedTuple):
     normal: Array
 
 
-class ConstraintMatrix(eqx.Module):
+class DelassusMatrix(eqx.Module):
     """Products and solves with the gradients `C` of all joints at one position.
 
     Gradients are with respect to velocities, so that `G = C M^-1 C^T`.
