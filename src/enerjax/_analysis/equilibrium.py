@@ -17,11 +17,11 @@ from .._types import Args, Coordinates, Flag, Multipliers, Real, Scalar
 
 # Long chains need many iterations: Newton's method wanders there before it converges.
 _MAX_ITERATIONS = 200
-# The descent makes so many attempts, of so many iterations each.
+# The largest number of attempts of the descent, and of iterations in one of them.
 _MAX_ATTEMPTS = 100
 _ITERATIONS_OF_ATTEMPT = 30
-# Without springs an attempt must converge within so many iterations. A longer search can
-# end in any pose, even many turns away.
+# The largest number of iterations of an attempt without springs. A longer search can end
+# in any pose, even many turns away.
 _ITERATIONS_WITHOUT_SPRINGS = 8
 # Springs that are softer than this fraction of the first ones are removed.
 _SOFTEST = 1e-6

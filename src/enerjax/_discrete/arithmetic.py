@@ -25,8 +25,9 @@ from .transform import (
 )
 
 
-# Both write the operation out, and bound the size of the program: an extreme over more
-# entries than this goes to the fallback, a power with twice this exponent through `exp`.
+# The limits up to which operations are written out, so that programs stay small. An extreme
+# over more entries is left to the fallback. A power with an exponent that is larger than
+# twice the second limit is computed as `exp(y log x)`.
 _LONGEST_CHAIN = 64
 _LARGEST_EXPONENT = 64
 
@@ -58,7 +59,7 @@ def linear(*positions: int) -> Rule:
         ends = push(at_a), push(at_b)
         if not any(isinstance(v, Switching) for v in values):
             return list(map(Moving, *ends, push(increment)))
-        # A choice that is only moved to another place keeps what decided it.
+        # The same numbers decide a choice that is only moved to another place.
         zero = lambda v: jnp.zeros(jnp.shape(v))
         squares = push(lambda v: v.squares if isinstance(v, Switching) else zero(v))
         decided = push(lambda v: v.decided if isinstance(v, Switching) else zero(v))

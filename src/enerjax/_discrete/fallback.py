@@ -85,7 +85,10 @@ def _reverse_jacobian(fn: Callable[[Array], list[Array]]) -> Callable:
 
 
 def _shared(primitive: Any, values: list[Value], params: dict[str, Any]) -> list[Value]:
-    """If only choices differ: the difference, shared among what decided them."""
+    """The outputs, where only choices differ between the points.
+
+    The difference is attributed to the numbers that decided the choices.
+    """
     squares, decided = _totals([v for v in values if isinstance(v, Switching)])
     outs = []
     ends = [evaluate(primitive, list(map(at, values)), params) for at in (at_a, at_b)]

@@ -22,7 +22,7 @@ from .transform import (
 
 def share(change: Array, squares: Array, decided: Array) -> Array:
     """`change`, as a linear function of the increments of the numbers that decided it."""
-    # If none of these has moved the change is round-off, and is attributed to none.
+    # If none of these numbers has changed, the change of the output is round-off.
     happens = (change != 0) & (squares != 0)
     weight = jnp.where(happens, change.astype(float) / jnp.where(happens, squares, 1), 0)
     return (weight * decided).astype(change.dtype)
@@ -83,8 +83,8 @@ def select(values: list[Value], params: dict[str, Any]) -> list[Value]:
     mean = sum(increments[1:], increments[0]) / len(cases)
     explained = sum((at_b(v) - at_a(v) for v in cases), jnp.zeros_like(a)) / len(cases)
     same = which.a == which.b
-    # The cases explain part of the change, unless one of them is a dummy value that avoids
-    # a singularity of the other.
+    # The mean increment of the cases explains part of the change, unless one case is a
+    # dummy value that stands where the other case is singular.
     rest = b - a - explained
     helps = jnp.abs(rest) <= jnp.abs(b - a)
     rest = jnp.where(same, 0, jnp.where(helps, rest, b - a))

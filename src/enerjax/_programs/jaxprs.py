@@ -44,7 +44,7 @@ def interpret(
 def evaluate(primitive: Any, values: list[Any], params: dict[str, Any]) -> list[Any]:
     """The outputs of a primitive, as a list."""
     bound = primitive.get_bind_params(params)
-    # A pair before JAX 0.10, the parameters alone since.
+    # Before JAX 0.10 this is a pair of functions and parameters, since then the parameters.
     functions, params = bound if isinstance(bound, tuple) else ((), bound)
     out = primitive.bind(*functions, *values, **params)
     return list(out) if primitive.multiple_results else [out]

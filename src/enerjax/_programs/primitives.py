@@ -11,7 +11,7 @@ def _names(text: str) -> frozenset[str]:
 
 # Entry by entry ---------------------------------------------------------------------------
 
-# What is left of arithmetic in a tangent: linear in its operands, or in each of them.
+# The arithmetic of tangents: linear in all operands together, or in each of them.
 ARITHMETIC = _names("add add_any convert_element_type div mul neg sub")
 ELEMENTARY = _names("""
     abs acos acosh asin asinh atan atan2 atanh cbrt cos cosh digamma erf erf_inv erfc exp
@@ -82,7 +82,7 @@ CALLS = {
     **dict.fromkeys(WITH_OWN_DERIVATIVE, "call_jaxpr"),
     **dict.fromkeys(_names("closed_call core_call"), "call_jaxpr"),
 }
-# Those of them that the versions of JAX with marks of one function do not have.
+# Wrappers that exist only in versions of JAX without the marks of one function.
 CALLS_OF_OTHER_VERSIONS = _names("checkpoint core_call pjit")
 # Loops and branches.
 CONTROL_FLOW = _names("cond scan while")

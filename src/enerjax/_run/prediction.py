@@ -1,4 +1,4 @@
-"""The initial guesses of Newton's method, and what they remember of the last steps."""
+"""The initial guesses of Newton's method, extrapolated from the last steps."""
 
 from typing import Any
 

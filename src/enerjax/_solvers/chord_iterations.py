@@ -20,9 +20,9 @@ from .newton_iterations import correction_size, max_norm, powers_of
 # The search stops without a root where a correction leaves more than this fraction of the
 # residual: Newton's method is then cheaper.
 _SHRINKS = 0.5
-# The estimate of what the next correction leaves uses at least this contraction. Residuals
-# of the two constraint levels shrink in turn, so a single quotient can be far too small:
-# without this bound two hinged bodies in space leak 3e-15 J a step; with it, 1e-16 J.
+# The smallest contraction that the estimate of the next residual assumes. Residuals of the
+# two constraint levels shrink in turn, so a single quotient can be far too small: without
+# this bound two hinged bodies in space leak 3e-15 J a step; with it, 1e-16 J.
 _LEAST_CONTRACTION = 1e-2
 # The search also stops without a root after this many corrections.
 _PATIENCE = 16

@@ -132,7 +132,9 @@ def _quaternion_hamiltonian(q: Coordinates, p: Coordinates, args: Args) -> Scala
     momentum = 0.25 * quaternion_rates(q) @ p
     spin = jnp.linalg.solve(_about_joint(args), momentum)
     height = rotation(q)[2] @ args["centre"]
-    stretching = 0.5 * (q @ p) ** 2  # of the redundant momentum; vanishes in the motion
+    stretching = (
+        0.5 * (q @ p) ** 2
+    )  # the energy of the redundant momentum, zero in a motion
     return 0.5 * momentum @ spin + stretching + args["m"] * args["g"] * height
 
 

@@ -1,4 +1,4 @@
-"""The gaps of joints: how far they are from closed."""
+"""The closure errors of joints, which users know as their gaps."""
 
 from typing import NamedTuple, TypeAlias
 
@@ -10,7 +10,7 @@ from .._programs import compiled
 from .._types import Coordinates, Scalar
 from ._frames import Frame, Numbers
 from ._functions import drives_at, inerters_at
-from ._laws import Driven, Flywheel, Length, Missed
+from ._laws import Deviation, Driven, Flywheel, Length
 from ._layout import Layout, Links
 from ._measures import Separation, Slide
 from ._parameters import Parameters
@@ -72,13 +72,15 @@ def measured(
         found.append((value, rate, bodies.extent[None], jnp.full((1,), jnp.inf)))
     for k, (group, numbers) in enumerate(kept(q, t)):
         assert isinstance(group.law, Driven | Flywheel)
-        missed = group._replace(law=Missed(group.law.measure))
+        deviation = group._replace(law=Deviation(group.law.measure))
 
-        def rows_at(x: Coordinates, t: Scalar, k: int = k, missed: Links = missed) -> Array:
-            return evaluate(missed, View(layout, x), kept(x, t)[k][1])
+        def rows_at(
+            x: Coordinates, t: Scalar, k: int = k, deviation: Links = deviation
+        ) -> Array:
+            return evaluate(deviation, View(layout, x), kept(x, t)[k][1])
 
         pair = jax.jvp(rows_at, (q, t), (qdot, jnp.ones_like(t)))
-        found.append(bodies.compared(missed, numbers, pair))
+        found.append(bodies.compared(deviation, numbers, pair))
     return found
 
 

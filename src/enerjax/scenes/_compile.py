@@ -25,8 +25,8 @@ from .forces import AbstractForce, Potential
 from .joints import AbstractJoint, Constraint
 
 
-# The kinds of parts that connect two bodies. Joints are first: others ask which axes they
-# keep.
+# The kinds of parts that connect two bodies. Joints are first, because other parts depend
+# on the axes that joints keep common to two bodies.
 LINKS = (AbstractJoint, AbstractForce, AbstractDrive, AbstractInerter)
 
 

@@ -23,7 +23,7 @@ from ._measures import AbstractLaw, AbstractMeasure, offset, Separation
 SAME_AXIS = ((2, 0), (2, 1))
 SAME_DIRECTIONS = ((0, 1), (1, 2), (2, 0))
 
-# What a joint leaves of the turning of its bodies against each other.
+# The direction that a joint keeps common to its bodies, or all of them.
 Keeps: TypeAlias = Literal["axis", "directions"] | None
 
 
@@ -160,7 +160,7 @@ class Driven(AbstractLaw):
         return self.measure.reads
 
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Multipliers:
-        return self.measure.away(a, b, numbers, numbers["value"])
+        return self.measure.constraint(a, b, numbers, numbers["value"])
 
 
 @dataclass(frozen=True)
@@ -174,11 +174,11 @@ class Flywheel(AbstractLaw):
         return self.measure.reads
 
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Multipliers:
-        return self.measure.away(a, b, numbers, numbers["value"])
+        return self.measure.constraint(a, b, numbers, numbers["value"])
 
 
 @dataclass(frozen=True)
-class Missed(AbstractLaw):
+class Deviation(AbstractLaw):
     """The difference of a measure from `numbers["value"]`, at which it is to be kept."""
 
     measure: AbstractMeasure
@@ -188,7 +188,7 @@ class Missed(AbstractLaw):
         return self.measure.reads
 
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Multipliers:
-        return self.measure.missed(a, b, numbers, numbers["value"])
+        return self.measure.deviation(a, b, numbers, numbers["value"])
 
 
 class AbstractForceLaw(AbstractLaw):

@@ -47,13 +47,13 @@ class AbstractMeasure(AbstractLaw):
     is_angle: ClassVar[bool] = False
     is_vector: ClassVar[bool] = False
 
-    def away(self, a: Frame, b: Frame, numbers: Numbers, value: Any) -> Multipliers:
-        """Rows that vanish if the measure has this value, and have slope one there."""
+    def constraint(self, a: Frame, b: Frame, numbers: Numbers, value: Any) -> Multipliers:
+        """Rows that vanish if the measure has this value, with slope one there."""
         return (self(a, b, numbers) - value).reshape(-1)
 
-    def missed(self, a: Frame, b: Frame, numbers: Numbers, value: Any) -> Multipliers:
+    def deviation(self, a: Frame, b: Frame, numbers: Numbers, value: Any) -> Multipliers:
         """The difference of the measure from this value, for reports."""
-        return self.away(a, b, numbers, value)
+        return self.constraint(a, b, numbers, value)
 
 
 @dataclass(frozen=True)
@@ -108,11 +108,11 @@ class AbstractTurn(AbstractMeasure):
         along, across = self.components(a, b, numbers)
         return jnp.arctan2(across, along)
 
-    def away(self, a: Frame, b: Frame, numbers: Numbers, value: Any) -> Multipliers:
+    def constraint(self, a: Frame, b: Frame, numbers: Numbers, value: Any) -> Multipliers:
         # The sine of the difference is smooth over any number of turns.
         return self._turned_back(a, b, numbers, value)[1].reshape(-1)
 
-    def missed(self, a: Frame, b: Frame, numbers: Numbers, value: Any) -> Multipliers:
+    def deviation(self, a: Frame, b: Frame, numbers: Numbers, value: Any) -> Multipliers:
         # The sine also vanishes half a turn away from the value, so the angle is reported.
         along, across = self._turned_back(a, b, numbers, value)
         return jnp.arctan2(across, along).reshape(-1)

@@ -1,4 +1,4 @@
-"""Small motions of the second body of a joint, by which gaps and reactions are defined."""
+"""Reactions of joints, which are defined by small motions of the second body."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

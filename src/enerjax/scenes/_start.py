@@ -13,7 +13,7 @@ from .._system import State, System
 from .._types import Real
 from ._closure_errors import by_name, Measured, measured
 from ._functions import drives_at
-from ._laws import Driven, Missed
+from ._laws import Deviation, Driven
 from ._layout import Layout
 from ._measures import AbstractTurn
 from ._parameters import Parameters
@@ -120,8 +120,8 @@ def _check_turns(layout: Layout, start: State, t: Real, args: Parameters) -> Sta
         measure = group.law.measure if isinstance(group.law, Driven) else None
         if not isinstance(measure, AbstractTurn):
             continue
-        missed = group._replace(law=Missed(measure))
-        error = jnp.abs(evaluate(missed, View(layout, start.q), numbers))[:, 0]
+        deviation = group._replace(law=Deviation(measure))
+        error = jnp.abs(evaluate(deviation, View(layout, start.q), numbers))[:, 0]
         opposite = jax.lax.stop_gradient(error > np.pi / 2)
         message = (
             "the start is nearer to the opposite of the prescribed angle: give the bodies "

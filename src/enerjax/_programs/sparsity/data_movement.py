@@ -25,7 +25,7 @@ def _slice(x, *, start_indices, limit_indices, strides, **_):
 
 
 def _pad(x, filling, *, padding_config, **_):
-    """Padding below zero takes entries away."""
+    """Negative padding removes entries."""
     lengths = [
         max(n + (n - 1) * inner, 0)
         for n, (_, _, inner) in zip(np.shape(x), padding_config, strict=True)

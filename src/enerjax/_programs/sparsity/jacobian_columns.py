@@ -81,7 +81,7 @@ class _Columns:
 def _trimmed(
     array: Array | np.ndarray, numbers: range, nonzero: np.ndarray | None
 ) -> _Columns:
-    """The columns without those at both ends that are zero."""
+    """Removes the columns of zeros at both ends."""
     if nonzero is None:
         return _Columns(array, numbers, None)
     own = _nonzero_range(nonzero)
@@ -107,7 +107,7 @@ def _in_columns(value: "Array | _Columns", numbers: range) -> Array:
         return array
     if not range(max(own.start, numbers.start), min(own.stop, numbers.stop)):
         return jnp.zeros((*array.shape[:-1], len(numbers)), array.dtype)
-    # Negative padding takes columns away.
+    # Negative padding removes columns.
     before, after = own.start - numbers.start, numbers.stop - own.stop
     config = (*((0, 0, 0) for _ in array.shape[:-1]), (before, after, 0))
     return lax.pad(array, jnp.zeros((), array.dtype), config)
@@ -121,7 +121,7 @@ def _hull(values: list[Any]) -> range:
     return range(min(x.start for x in numbers), max(x.stop for x in numbers))
 
 
-# A sum is cut into at most so many parts.
+# The largest number of parts into which a sum is divided.
 _MAX_PARTS = 8
 
 

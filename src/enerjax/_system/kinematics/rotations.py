@@ -51,8 +51,8 @@ class RigidKinematics(AbstractKinematics):
         return False
 
     def has_inertia(self, energy, inertia):
-        # That the energy depends on velocities in body axes alone, as for a body with its
-        # mass centre as `x`: it is the same where each body has another random rotation.
+        # The energy must depend on velocities in body axes alone, as it does for a body
+        # with its mass centre at `x`. It is compared with that of randomly rotated bodies.
         bodies, random, dtype = self.bodies, np.random.default_rng(0), inertia.dtype
         probe = jnp.cos(jnp.arange(1, bodies.num_velocities + 1, dtype=dtype))
 

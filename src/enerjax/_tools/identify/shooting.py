@@ -21,9 +21,9 @@ class MultipleShooting(eqx.Module):
     """The residuals of a run that is divided into windows, for `fit`.
 
     In a chaotic motion the effect of a small change of a parameter grows exponentially, so
-    the cost of a long run has many local minima. Within short windows it has not. The start
-    of each window is an unknown of the fit, and additional residuals require that each
-    window starts where the one before ends:
+    the cost of a long run has many local minima, and that of a short window has few. The
+    start of each window is an unknown of the fit, and additional residuals require that
+    each window starts where the one before ends:
 
         def window(parameters, start, data):
             sol = ej.simulate(system, scheme, state_of(start), parameters, ...)

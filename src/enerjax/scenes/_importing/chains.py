@@ -1,15 +1,14 @@
 """Several hinges and slides in a row between two bodies, with no bodies between them.
 
-A body of MuJoCo may have several joints, each on what the one before it moves. A scene has
-no bodies without mass to put between them, so their coordinates are eliminated: the rows
-are what is left of the relative motion, and each coordinate is a function of the frames of
-the two bodies.
+A body of MuJoCo may have several joints, each of which moves the next one. A scene cannot
+put bodies without mass between them, so the coordinates of the joints are eliminated. The
+rows are the conditions on the relative motion that do not contain these coordinates, and
+each coordinate is a function of the frames of the two bodies.
 
-Between two hinges that follow each other there is a *stage*, a frame that neither body
-has. The first stage is body `a`, the last is body `b`. A stage between holds the axes of
-the hinges before and behind it, which determine it. Of three hinges, the axis of the second
-follows from its angles to the others; there are two such directions, and `branch` tells
-which of them.
+The frame between two successive hinges is called a *stage*. The first stage is body `a`,
+the last is body `b`. A stage between them is determined by the axes of the hinges before
+and behind it. In a chain of three hinges, the axis of the second follows from its angles to
+the two others; two directions have these angles, and `branch` tells which one is meant.
 """
 
 from dataclasses import dataclass
@@ -204,7 +203,7 @@ class ChainSlide(AbstractMeasure):
 
 @dataclass(frozen=True)
 class ChainCoordinate(AbstractConstraintLaw):
-    """No rows, but a measure: so a coordinate of a chain is known by name."""
+    """A law without rows, which gives the coordinate of one joint of a chain a name."""
 
     measure: AbstractMeasure
 

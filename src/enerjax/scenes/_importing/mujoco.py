@@ -1,4 +1,4 @@
-"""MuJoCo, which is imported when something of it is first used.
+"""MuJoCo, which is imported when one of its names is first used.
 
 It is an optional package. The other modules write `mujoco.MjData` and the like.
 """
@@ -7,7 +7,7 @@ from typing import Any
 
 
 def __getattr__(name: str) -> Any:
-    if name.startswith("__"):  # of Python's own, which asks any module for some
+    if name.startswith("__"):  # Python asks every module for some of these
         raise AttributeError(name)
     try:
         import mujoco  # pyright: ignore[reportMissingImports]
