@@ -132,9 +132,8 @@ def _quaternion_hamiltonian(q: Coordinates, p: Coordinates, args: Args) -> Scala
     momentum = 0.25 * quaternion_rates(q) @ p
     spin = jnp.linalg.solve(_about_joint(args), momentum)
     height = rotation(q)[2] @ args["centre"]
-    stretching = (
-        0.5 * (q @ p) ** 2
-    )  # the energy of the redundant momentum, zero in a motion
+    # The energy of the redundant momentum, which is zero in a motion.
+    stretching = 0.5 * (q @ p) ** 2
     return 0.5 * momentum @ spin + stretching + args["m"] * args["g"] * height
 
 
