@@ -90,9 +90,9 @@ def test_the_results_can_be_plotted():
     import matplotlib.pyplot as plt
 
     for measured in (orders(), against_data()):
-        figure = measured.plot()
-        assert [len(axes.lines) for axes in figure.axes] == [2, 2]
-        plt.close(figure)
+        grid = measured.plot()
+        assert [len(axes.lines) for axes in grid] == [2, 2]
+        plt.close("all")
 
 
 def test_a_failed_run_has_a_row_with_the_reason():

@@ -8,6 +8,7 @@ from .animation import Animation as Animation, frame_times as frame_times
 from .axes import (
     axes_of as axes_of,
     grid_of as grid_of,
+    headline as headline,
     label as label,
     legend_above as legend_above,
     tell as tell,

@@ -34,14 +34,14 @@ def checked(ax: Any) -> Axes:
     return ax
 
 
-def grid_of(axes: Any, count: int, figsize: tuple[float, float]) -> np.ndarray:
-    """`axes` as a flat array of `count`, or new ones in two columns.
+def grid_of(axes: Any, rows: int, figsize: tuple[float, float]) -> np.ndarray:
+    """`axes` as a flat array, or new ones in some rows of two.
 
     **Raises:** `ValueError` for another number of axes.
     """
+    count = 2 * rows
     if axes is None:
-        rows = -(-count // 2)
-        axes = plt.subplots(rows, 2, figsize=figsize, layout="constrained", sharex=True)[1]
+        axes = plt.subplots(rows, 2, figsize=figsize, layout="constrained")[1]
     flat = np.ravel(np.asarray(axes, object))
     if len(flat) != count:
         raise ValueError(f"This picture needs {count} axes, got {len(flat)}.")
@@ -69,9 +69,10 @@ def label(quantity: str, units: Units | None, dimension: str | None = None) -> s
     return f"{quantity} [{unit}]" if unit else quantity
 
 
-def legend_above(ax: Axes, columns: int) -> None:
+def legend_above(ax: Axes, columns: int, handles: Any = None) -> None:
     """A legend outside of the axes, where it hides no curve."""
     ax.legend(
+        handles=handles,
         fontsize="small",
         ncols=columns,
         frameon=False,
@@ -84,6 +85,11 @@ def legend_above(ax: Axes, columns: int) -> None:
 def tell(ax: Axes, text: str) -> Any:
     """A line in red at the foot of the axes."""
     return _in_corner(ax, text, 0.02, "C3")
+
+
+def headline(ax: Axes, text: str) -> None:
+    """A line in red above the axes, where it covers nothing."""
+    ax.set_title(text, color="C3", fontsize="small")
 
 
 def clock(ax: Axes, text: str) -> Any:

@@ -234,6 +234,7 @@ class SpaceCanvas(AbstractCanvas):
         ):
             set_limits(m - s / 2, m + s / 2)
         ax.set_box_aspect(size, zoom=0.9)
+        ax.zaxis.labelpad = 10  # of the length of its ticks
 
     def write(self, point: Array, text: str, color: Array) -> Any:
         ax: Any = self.ax

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from .animation import Animation
-from .axes import axes_of, checked, clock, in_space, label, tell, Units
+from .axes import axes_of, checked, clock, headline, in_space, label, Units
 from .canvas import AbstractCanvas, Drawing, PlaneCanvas, SpaceCanvas
 
 
@@ -107,7 +107,7 @@ def film(
     canvas = canvas_of(ax, bounds, units)
     canvas.frame(*bounds)
     if outcome:
-        tell(ax, f"the run ends at t = {ts[-1]:.4g}: {outcome}")
+        headline(ax, f"the run ends at t = {ts[-1]:.4g}: {outcome}")
     now, text = clock(ax, ""), _time_text(ts, speed, units)
     marks = []
     if beside is not None:

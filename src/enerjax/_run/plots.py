@@ -26,14 +26,14 @@ def plot_energy(sol: Solution, ax: Any, units: Units | None) -> Axes:
 def plot_run(sol: Solution, axes: Any, units: Units | None) -> np.ndarray:
     """Energies, their account, constraints and steps in four axes."""
     rows = ReachedRows(sol)
-    grid = grid_of(axes, 4, (9.0, 6.0))
+    grid = grid_of(axes, 2, (9.0, 6.0))
     plot_energy(sol, grid[0], units)
     _account(rows, sol.audit, grid[1], units)
     _constraints(rows, sol.audit, grid[2])
     _steps(rows, sol.stats, grid[3])
     for ax in grid:
         ax.set_xlabel(label("time", units))
-    return grid if axes is None else np.asarray(axes)
+    return grid
 
 
 def _account(rows: ReachedRows, audit: Audit, ax: Axes, units: Units | None) -> None:

@@ -180,7 +180,8 @@ class Solution(eqx.Module):
         - `axes`: four axes of matplotlib to draw into; new ones by default.
         - `units`: names for the labels, such as `{"time": "s", "energy": "J"}`.
 
-        **Returns:** the axes. A run that failed is shown as far as it came.
+        **Returns:** the axes, an array of shape `(4,)`. A run that failed is shown as far
+        as it came.
 
         **Raises:** `ValueError` for a batch of runs, and for a run without rows.
         """

@@ -14,12 +14,15 @@ from .._pictures import (
     color_of,
     Drawing,
     film,
+    headline,
     joint_bounds,
     label,
+    legend_above,
     tell,
     Trail,
     Units,
 )
+from .._run import ReachedRows, Solution
 from ._frames import GROUND
 from ._motion import Array, Motion
 from ._reactions import Reaction
@@ -100,7 +103,7 @@ def draw(
     if names:
         _write_names(canvas, motion)
     if motion.outcome:
-        tell(canvas.ax, f"the run ends at t = {whole.ts[-1]:.4g}: {motion.outcome}")
+        headline(canvas.ax, f"the run ends at t = {whole.ts[-1]:.4g}: {motion.outcome}")
     return canvas.ax
 
 
@@ -119,7 +122,7 @@ def _write_names(canvas: AbstractCanvas, motion: Motion) -> None:
 def animate(
     motion: Motion,
     whole: Motion,
-    sol: Any,
+    sol: Solution,
     ax: Any,
     fps: float,
     speed: float,
@@ -149,24 +152,25 @@ def animate(
 
 
 def plot_reaction(
-    sol: Any, found: Reaction, joint: str, ax: Any, units: Units | None
+    sol: Solution, found: Reaction, joint: str, ax: Any, units: Units | None
 ) -> Axes:
     """The components of a force and, on an axis at the right, of a torque."""
-    ax = axes_of(ax)
-    ts, force, torque = (np.asarray(x) for x in (sol.ts, found.force, found.torque))
+    rows, ax = ReachedRows(sol), axes_of(ax)
+    force, torque = rows(found.force), rows(found.torque)
     for k, column in enumerate(force.T):
-        ax.plot(ts, column, f"C{k}", label=f"force {'xyz'[k]}")
+        ax.plot(rows.ts, column, f"C{k}", label=f"force {'xyz'[k]}")
     ax.set(xlabel=label("time", units), ylabel=f"{joint}: {label('force', units)}")
-    names = ["torque"] if torque.shape[1] == 1 else [f"torque {x}" for x in "xyz"]
-    largest = lambda x: float(np.nanmax(np.abs(x), initial=0.0))
+    handles = ax.get_lines()
     # Of a pin without a torque there is round-off.
-    if largest(torque) > 1e-9 * largest(force) * largest(sol.ys.q):
+    largest = lambda x: float(np.max(np.abs(x)))
+    if largest(torque) > 1e-9 * largest(force) * largest(rows(sol.ys.q)):
         beside: Any = ax.twinx()
+        names = ["torque"] if torque.shape[1] == 1 else [f"torque {x}" for x in "xyz"]
         for k, column in enumerate(torque.T):
-            beside.plot(ts, column, f"C{k + 3}--", label=names[k])
+            beside.plot(rows.ts, column, f"C{k + 3}--", label=names[k])
         beside.set_ylabel(label("torque", units))
-        handles = ax.get_lines() + beside.get_lines()
-        ax.legend(handles, [x.get_label() for x in handles], fontsize="small")
-    else:
-        ax.legend(fontsize="small")
+        handles = [*handles, *beside.get_lines()]
+    legend_above(ax, 3, handles)
+    if rows.outcome:
+        tell(ax, f"the run ends at t = {rows.ts[-1]:.4g}: {rows.outcome}")
     return ax

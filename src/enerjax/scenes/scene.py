@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from .._analysis import ConsistentStart, Equilibrium, freedoms, Mobility
 from .._programs import is_known
-from .._run import Solution
+from .._run import ReachedRows, Solution
 from .._system import State, System
 from .._types import Coordinates, Real, Vector
 from ._closure_errors import Gap, Measured
@@ -322,6 +322,7 @@ class Scene:
         from .._pictures import frame_times
         from ._drawing import animate
 
+        ReachedRows(sol)  # checks that it is one run
         whole = self.motion(sol, None, args)
         times = frame_times(whole.ts[0], whole.ts[-1], speed, fps)
         shown = self.motion(sol, times, args)
@@ -381,6 +382,7 @@ class Scene:
         """
         from ._drawing import plot_reaction
 
+        ReachedRows(sol)  # checks that it is one run
         found = self.reaction(sol, joint, args)
         return plot_reaction(sol, found, joint, ax, units)
 

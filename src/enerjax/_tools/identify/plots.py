@@ -9,7 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from matplotlib.axes import Axes
 
-from ..._pictures import axes_of, label, Units
+from ..._pictures import axes_of, label, legend_above, Units
 from .estimate import Fit, student
 
 
@@ -43,7 +43,7 @@ def plot_prediction(
         ax.plot(times, mean, color=color, linewidth=1, label=f"fit{name}")
         ax.fill_between(times, mean - width, mean + width, color=color, alpha=0.25, lw=0)
     ax.set_xlabel("row of the data" if ts is None else label("time", units))
-    ax.legend(fontsize="small")
+    legend_above(ax, 4)
     return ax
 
 

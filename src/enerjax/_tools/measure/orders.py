@@ -57,17 +57,18 @@ class OrderTable:
                 rows.append([*cells, self.failures[i][j]])
         return with_uncertainty(rows, self.uncertainty)
 
-    def plot(self) -> Any:
-        """Errors of positions and velocities against the step, as a figure."""
-        import matplotlib.pyplot as plt
+    def plot(self, axes: Any = None) -> Any:
+        """Errors of positions and velocities against the step, in two axes, which are
+        returned."""
+        from ..._pictures import grid_of
 
-        figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+        axes = grid_of(axes, 1, (10.0, 4.0))
         for axis, name in zip(axes, ("q", "v"), strict=True):
             for scheme, error in zip(self.schemes, getattr(self, name), strict=True):
                 axis.loglog(self.h, error, "o-", label=scheme)
             axis.set(xlabel="h", ylabel=f"largest error in {name}")
         axes[1].legend()
-        return figure
+        return axes
 
 
 def order_table(

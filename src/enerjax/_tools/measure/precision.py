@@ -76,13 +76,12 @@ class WorkPrecision:
                 rows.append((name, f"{h:.4g}", *errors, *costs, self.failures[i][j]))
         return with_uncertainty(rows, self.uncertainty)
 
-    def plot(self) -> Any:
-        """Error of the positions against time and against corrections, as a figure."""
-        import matplotlib.pyplot as plt
+    def plot(self, axes: Any = None) -> Any:
+        """Error of the positions against time and against corrections, in two axes, which
+        are returned."""
+        from ..._pictures import grid_of
 
-        figure, axes = plt.subplots(
-            1, 2, figsize=(10, 4), layout="constrained", sharey=True
-        )
+        axes = grid_of(axes, 1, (10.0, 4.0))
         for name, error, *costs in zip(
             self.schemes, self.q, self.seconds, self.evaluations, strict=True
         ):
@@ -91,7 +90,7 @@ class WorkPrecision:
         axes[0].set(xlabel="processor time [s]", ylabel="largest error in q")
         axes[1].set(xlabel="Newton corrections")
         axes[1].legend()
-        return figure
+        return axes
 
 
 def work_precision(

@@ -7,12 +7,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ..._pictures import legend_above
 from .runs import Lookup, Run
 
 
 PRESERVING = "preserving index3"
 DECAYING = "decaying index3"
 KAPPA = "decaying kappa"
+
+_LEGEND = 18  # the height of a legend below the title, in points of the printer
 
 
 def _cartesian(run: Run) -> tuple[np.ndarray, np.ndarray]:
@@ -47,14 +50,7 @@ def _components(axes: Axes, run: Run, values: np.ndarray, names: Iterable[str]) 
 
 def energies(axes: Axes, runs: Iterable[Run]) -> None:
     for run in runs:
-        audit = run.solution.audit
-        for values, label, colour in (
-            (audit.kinetic, "kinetic", "tab:blue"),
-            (audit.potential, "potential", "tab:green"),
-            (audit.energy, "total", "tab:red"),
-        ):
-            axes.plot(run.solution.ts, values, colour, linewidth=0.9, label=label)
-    axes.set_ylabel("energy [J]")
+        run.solution.plot_energy(axes, units={"time": "s", "energy": "J"})
 
 
 def energy_changes(axes: Axes, runs: Iterable[Run]) -> None:
@@ -138,10 +134,11 @@ def write_figures(find: Lookup, folder: Path) -> list[Path]:
             ends = [
                 f"fails at t = {r.solution.ts[r.rows][-1]:.3g}" for r in runs if r.failed
             ]
-            axes.set_title(", ".join([name, *ends]), fontsize="medium")
-            axes.set_xlabel("time [s]")
+            title = ", ".join([name, *ends])
             if axes.get_legend_handles_labels()[0]:
-                axes.legend(fontsize="x-small")
+                legend_above(axes, 4)
+            axes.set_title(title, fontsize="medium", pad=_LEGEND)
+            axes.set_xlabel("time [s]")
         out.append(folder / f"figure-{number:02d}.png")
         figure.savefig(out[-1], dpi=120)
     return out
