@@ -3,7 +3,6 @@
 import operator
 import pathlib
 import re
-import runpy
 
 import matplotlib.pyplot as plt
 import pytest
@@ -37,6 +36,9 @@ def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
         if not mark:
             exec(compile(code, str(page), "exec"), names)
     plt.close("all")
+    if page.name == "pictures.md":
+        shown = re.findall(r"\]\(pictures/([^)]+)\)", page.read_text())
+        assert sorted(path.name for path in tmp_path.iterdir()) == sorted(shown)
 
 
 def test_every_mark_is_known():
@@ -87,10 +89,3 @@ def test_the_table_of_subpackages_is_complete():
     names = [path.parent.name for path in package.glob("*/__init__.py")]
     assert len(names) > 5
     assert [name for name in names if f"| `{name}` |" not in text] == []
-
-
-@pytest.mark.slow
-def test_the_moving_picture_can_be_drawn(tmp_path):
-    script = runpy.run_path(str(DOCS / "moving_picture.py"))
-    script["draw"](tmp_path / "picture.gif", num_steps=5)
-    assert (tmp_path / "picture.gif").read_bytes().startswith(b"GIF89a")

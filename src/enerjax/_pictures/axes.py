@@ -70,14 +70,14 @@ def label(quantity: str, units: Units | None, dimension: str | None = None) -> s
 
 
 def legend_above(ax: Axes, columns: int, handles: Any = None) -> None:
-    """A legend outside of the axes, where it hides no curve."""
+    """A legend outside of the axes, where it hides no curve, nor a power of ten."""
     ax.legend(
         handles=handles,
         fontsize="small",
         ncols=columns,
         frameon=False,
-        loc="lower center",
-        bbox_to_anchor=(0.5, 1.0),
+        loc="lower right",
+        bbox_to_anchor=(1.0, 1.0),
         borderaxespad=0.2,
     )
 

@@ -75,6 +75,7 @@ def _spatial_axes(figure: Any, place: Any) -> Any:
     ax = figure.add_subplot(place, projection="3d")
     ax.view_init(elev=22, azim=-55)
     ax.locator_params(nbins=5)
+    ax.tick_params(labelsize="small")  # those of two axes meet in corners
     return ax
 
 

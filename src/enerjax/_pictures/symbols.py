@@ -13,6 +13,8 @@ Array: TypeAlias = np.ndarray
 
 GREY = color_of("0.6")
 _DARK, _RED = color_of("0.25"), color_of("C3")
+# The radius of balls in space over the size of the picture.
+_BALL = 0.022
 
 
 class PlaneSymbols:
@@ -21,7 +23,10 @@ class PlaneSymbols:
     def __init__(self, size: float):
         self._size = size
 
-    def joint(self, symbol: str, place: Array, axes: list[Array], fixed: bool) -> Drawing:
+    def joint(
+        self, symbol: str, place: Array, axes: list[Array], fixed: bool, inside: float
+    ) -> Drawing:
+        del inside  # bodies are transparent in the plane
         size = 3.0 if symbol == "weld" else 5.0
         dot = Dot(place, _DARK, size, 0.04 * self._size, symbol == "weld")
         return Drawing(faces=self._foot(place) if fixed else (), dots=(dot,))
@@ -99,15 +104,20 @@ class SpaceSymbols:
 
     def __init__(self, size: float):
         self._size = size
-        self._ball = ball(0.022 * size)
+        self._ball = ball(_BALL * size)
 
-    def joint(self, symbol: str, place: Array, axes: list[Array], fixed: bool) -> Drawing:
+    def joint(
+        self, symbol: str, place: Array, axes: list[Array], fixed: bool, inside: float
+    ) -> Drawing:
+        """A pin along its axes, or a ball; `inside` is the radius of rods about it."""
         color = GREY if fixed else _DARK
         if symbol == "pin" and axes:
             arm, radius = 0.05 * self._size, 0.018 * self._size
             paths = [np.array([place - arm * x, place + arm * x]) for x in axes]
             return Drawing(tuple(Faces(_closed(x, radius), color) for x in paths))
-        return Drawing((Faces(place + self._ball, color),))
+        # A ball is seen where it is thicker than rods, if it is not too large for that.
+        scale = np.clip(1.25 * inside / (_BALL * self._size), 1.0, 2.0)
+        return Drawing((Faces(place + scale * self._ball, color),))
 
     def slider(self, low: Array, high: Array, end: Array) -> Drawing:
         guide = self._tube(low, high, 0.008, GREY)

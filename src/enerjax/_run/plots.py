@@ -51,7 +51,7 @@ def _account(rows: ReachedRows, audit: Audit, ax: Axes, units: Units | None) -> 
         total = np.cumsum(rows(values))
         if np.any(total != 0):
             ax.plot(rows.ts, total, "--" if name.startswith("of") else "-", label=name)
-    ax.set_ylabel(f"since the start: {label('energy', units)}")
+    ax.set_ylabel(label("energy since the start", units, "energy"))
     legend_above(ax, 2)
 
 

@@ -26,7 +26,7 @@ from .._run import ReachedRows, Solution
 from ._frames import GROUND
 from ._motion import Array, Motion
 from ._reactions import Reaction
-from ._sketch import Sketch
+from ._sketch import middle_of, Sketch
 
 
 class Trace(NamedTuple):
@@ -63,15 +63,16 @@ def traces_of(traces: Any, motion: Motion) -> list[Trace]:
     return found
 
 
-def _trails(traces: list[Trace], motion: Motion) -> list[tuple[Trail, Trace, Array]]:
+def _trails(
+    traces: list[Trace], motion: Motion, colors: dict[str, Array]
+) -> list[tuple[Trail, Trace, Array]]:
     """The path of each trace along a motion, and its colour, that of the body."""
     bodies = {body.name: body for body in motion.bodies}
-    numbers = {name: k for k, name in enumerate(x for x in bodies if x != GROUND)}
     found = []
     for trace in traces:
         body = bodies[trace.body]
         path = Trail(motion.ts, body.position + body.rotation @ trace.point)
-        found.append((path, trace, color_of(f"C{numbers.get(trace.body, 0) % 10}")))
+        found.append((path, trace, colors[trace.body]))
     return found
 
 
@@ -88,7 +89,7 @@ def draw(
     `whole` is the motion along which traces are drawn.
     """
     sketch = Sketch(motion, whole)
-    trails = _trails(traces_of(traces, motion), whole)
+    trails = _trails(traces_of(traces, motion), whole, sketch.colors)
     bounds = joint_bounds(sketch.bounds(), [trail.points for trail, _, _ in trails])
     canvas = canvas_of(ax, bounds, units)
     count = len(motion.ts)
@@ -101,19 +102,21 @@ def draw(
     canvas.frame(*bounds)
     canvas.show(drawing)
     if names:
-        _write_names(canvas, motion)
+        _write_names(canvas, motion, sketch.colors)
     if motion.outcome:
         headline(canvas.ax, f"the run ends at t = {whole.ts[-1]:.4g}: {motion.outcome}")
     return canvas.ax
 
 
-def _write_names(canvas: AbstractCanvas, motion: Motion) -> None:
+def _write_names(canvas: AbstractCanvas, motion: Motion, colors: dict[str, Array]) -> None:
     """The names of bodies and of joints, moved apart."""
-    texts = []
-    for k, body in enumerate(x for x in motion.bodies if x.name != GROUND):
-        texts.append(canvas.write(body.position[-1], body.name, color_of(f"C{k % 10}")))
+    texts = [
+        canvas.write(body.position[-1], body.name, colors[body.name])
+        for body in motion.bodies
+        if body.name != GROUND
+    ]
     texts += [
-        canvas.write((link.start[-1] + link.end[-1]) / 2, link.name, color_of("0.4"))
+        canvas.write(middle_of(link, -1), link.name, color_of("0.4"))
         for link in motion.links
     ]
     canvas.move_apart(texts)
@@ -134,7 +137,7 @@ def animate(
     sketch = Sketch(motion, motion)
     # Along the rows or the frames, of whichever there are more.
     finer = max(motion, whole, key=lambda x: len(x.ts))
-    trails = _trails(traces_of(traces, motion), finer)
+    trails = _trails(traces_of(traces, motion), finer, sketch.colors)
 
     def at(k: int) -> Drawing:
         drawing, bodies = Drawing(), {body.name: body for body in motion.bodies}

@@ -16,6 +16,7 @@ from .._pictures import (
 )
 from ._frames import GROUND
 from ._motion import Array, BodyMotion, LinkMotion, Motion
+from .shapes import Capsule
 
 
 class Sketch:
@@ -30,16 +31,18 @@ class Sketch:
         self.size = _size(motion)
         kind = PlaneSymbols if self.dimension == 2 else SpaceSymbols
         self._symbols = kind(self.size)
+        self.colors = _colors(motion)
         self._bodies = [
-            _BodySketch(body, k, self.size) for k, body in enumerate(_ground_last(motion))
+            _BodySketch(body, self.colors[body.name], self.size) for body in motion.bodies
         ]
+        self._thickness = {body.name: _thickness(body) for body in motion.bodies}
         sliders = [x for x in whole.links if x.symbol == "slider"]
         self._slides = {x.name: _range_of(x, 0.12 * self.size) for x in sliders}
 
     def at(self, k: int) -> Drawing:
         """The drawing at the time with this number."""
         parts = Drawing()
-        for body in reversed(self._bodies):
+        for body in self._bodies:
             parts += body.at(k)
         for link in self.motion.links:
             parts += self._link(link, k)
@@ -64,7 +67,8 @@ class Sketch:
         fixed = GROUND in link.bodies
         match link.symbol:
             case "pin" | "weld" | "plane" | "contact":
-                return symbols.joint(link.symbol, end, axes, fixed)
+                inside = max(self._thickness.get(body, 0.0) for body in link.bodies)
+                return symbols.joint(link.symbol, end, axes, fixed, inside)
             case "slider":
                 low, high = self._slides[link.name]
                 guide = start + low * axes[0], start + high * axes[0]
@@ -83,9 +87,28 @@ def _dimension(motion: Motion) -> int:
     return motion.bodies[0].position.shape[1]
 
 
-def _ground_last(motion: Motion) -> list[BodyMotion]:
-    """The bodies; the ground, if it is seen, comes last, so that it takes no colour."""
-    return sorted(motion.bodies, key=lambda body: body.name == GROUND)
+def middle_of(link: LinkMotion, k: int) -> Array:
+    """Where the symbol of a link is."""
+    has_length = link.symbol in ("rod", "spring", "damper", "actuator", "field")
+    return (link.start[k] + link.end[k]) / 2 if has_length else link.end[k]
+
+
+def _colors(motion: Motion) -> dict[str, Array]:
+    """The colours of the bodies by name: those of their shapes, or else of a cycle."""
+    moving = [body.name for body in motion.bodies if body.name != GROUND]
+    cycle = {name: color_of(f"C{k % 10}") for k, name in enumerate(moving)}
+    found = {}
+    for body in motion.bodies:
+        given = [x.color for x in body.shapes if x.color is not None]
+        opaque = (color_of(x[:3]) for x in given)
+        found[body.name] = next(opaque, cycle.get(body.name, GREY))
+    return found
+
+
+def _thickness(body: BodyMotion) -> float:
+    """The radius of the rods of a body."""
+    radii = [float(x.radius) for x in body.shapes if isinstance(x, Capsule)]
+    return max(radii, default=0.0)
 
 
 def _points_of(body: BodyMotion) -> Array:
@@ -124,10 +147,9 @@ def _range_of(link: LinkMotion, room: float) -> tuple[float, float]:
 class _BodySketch:
     """The polygons and lines of a body, in its frame."""
 
-    def __init__(self, body: BodyMotion, number: int, size: float):
+    def __init__(self, body: BodyMotion, default: Array, size: float):
         self._body = body
         fixed = body.name == GROUND
-        default = GREY if fixed else color_of(f"C{number % 10}")
         flat = body.position.shape[1] == 2
         self._faces: list[Faces] = []
         self._paths: list[Path] = []
