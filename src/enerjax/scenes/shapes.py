@@ -409,10 +409,10 @@ def _color(kind: str, color: Any) -> tuple[float, ...] | None:
 def _rounded(radius: float, length: float, dimension: int) -> Facets:
     """All points within `radius` of a line of some length about the middle."""
     if dimension == 2:
-        turn = np.linspace(0, 2 * np.pi, 2 * _SIDES, endpoint=False)
-        x, y = radius * np.cos(turn), radius * np.sin(turn)
-        along = x + np.copysign(length / 2, x)
-        return Facets(np.stack([along, y], axis=1), (np.arange(turn.size),))
+        turn = np.linspace(-np.pi / 2, np.pi / 2, _SIDES + 1)
+        x, y = length / 2 + radius * np.cos(turn), radius * np.sin(turn)
+        right = np.stack([x, y], axis=1)
+        return Facets(np.concatenate([right, -right]), (np.arange(2 * turn.size),))
     turn = np.linspace(-np.pi / 2, np.pi / 2, _SIDES // 2)
     height = radius * np.sin(turn)
     along = height + np.copysign(length / 2, height)
