@@ -19,7 +19,7 @@ from PIL.GifImagePlugin import GifImageFile
 import enerjax as ej
 
 
-G, SPIN, THROW = 9.81, 7.0, np.array([2.0, 3.0])
+G, SPIN, SPIN_UP, THROW = 9.81, 7.0, 3.0, np.array([2.0, 3.0])
 UNITS = {"time": "s", "length": "m", "energy": "J", "force": "N", "torque": "N m"}
 
 
@@ -32,12 +32,14 @@ def no_windows():
 
 @functools.cache
 def thrown():
-    """A rod that is thrown: its centre moves on a parabola, its angle grows evenly, and a
-    quadratic potential makes both exact."""
+    """A rod that is thrown, with a motor that turns it: its centre moves on a parabola, and
+    its angle is a quadratic function of time. The scheme makes both exact."""
     rod = ej.bodies.PlanarBody.rod(
         "stick", 2.0, [0.0, 0.0], [1.0, 0.0], velocity=THROW, angular_velocity=SPIN
     )
-    scene = ej.Scene([rod], gravity=[0.0, -G])
+    turn = lambda t, args: SPIN * t + SPIN_UP * t**2 / 2
+    motor = ej.drives.Angle("motor", "ground", "stick", turn)
+    scene = ej.Scene([rod, motor], gravity=[0.0, -G])
     system, start, args = scene.build()
     scheme = ej.EnergyPreserving()
     return scene, ej.simulate(system, scheme, start, args, h=0.07, num_steps=10)
@@ -47,7 +49,7 @@ def thrown_pose(t):
     t = np.asarray(t)
     centre = np.array([0.5, 0.0]) + THROW * t[..., None]
     centre[..., 1] -= 0.5 * G * t**2
-    return centre, SPIN * t
+    return centre, SPIN * t + SPIN_UP * t**2 / 2
 
 
 @functools.cache
@@ -96,6 +98,11 @@ def polygons(ax):
     return [path.vertices[:-1] for path in ax.collections[0].get_paths()]
 
 
+def rods(ax):
+    """The polygons that are no triangles, as symbols are."""
+    return [x for x in polygons(ax) if len(x) > 3]
+
+
 def segments(ax):
     return [np.array(x) for x in ax.collections[1].get_segments()]
 
@@ -120,7 +127,7 @@ def test_bodies_are_drawn_where_the_run_has_them_and_earlier_ones_paler():
     times = np.array([0.1, 0.33, 0.7])  # two of them between rows
     ax = scene.draw(sol, times)
     centres, angles = thrown_pose(times)
-    shown = polygons(ax)
+    shown = rods(ax)
     assert len(shown) == 3
     for corners, centre, angle in zip(shown, centres, angles, strict=True):
         # Round-off: motion and interpolation are exact for these polynomials.
@@ -130,14 +137,14 @@ def test_bodies_are_drawn_where_the_run_has_them_and_earlier_ones_paler():
         length = np.ptp((corners - centre) @ [np.cos(angle), np.sin(angle)])
         assert 0 < radius < 0.1
         np.testing.assert_allclose(length, 1.0 + 2 * radius, atol=1e-12)
-    opacity = ax.collections[0].get_facecolor()[:, 3]
+    opacity = ax.collections[0].get_facecolor()[::2, 3]  # without the motors'
     assert np.all(np.diff(opacity) > 0)
 
 
 def test_without_times_the_last_row_is_drawn_and_without_a_run_the_start():
     scene, sol = thrown()
     for ax, t in ((scene.draw(sol), 0.7), (scene.draw(), 0.0), (scene.draw(sol.end), 0.7)):
-        (corners,) = polygons(ax)
+        (corners,) = rods(ax)
         np.testing.assert_allclose(corners.mean(axis=0), thrown_pose(t)[0], atol=1e-12)
 
 
@@ -152,7 +159,7 @@ def test_joints_springs_and_traces_are_where_the_bodies_are():
     for place in ([0.0, 0.0], [1.0, 1.0], tip[-1]):
         assert np.abs(dots(ax) - place).max(axis=1).min() < 1e-12
     # The rod ends in the hinge and in the spring; a triangle is the ground below the hinge.
-    (rod,) = (x for x in polygons(ax) if len(x) > 3)
+    (rod,) = rods(ax)
     for end in ([0.0, 0.0], tip[-1]):
         near = np.linalg.norm(rod - end, axis=1).min()
         assert near == pytest.approx(0.03, abs=0.01)
@@ -226,11 +233,11 @@ def test_frames_are_at_real_time_whatever_the_steps_were():
     ax = film.figure.axes[0]
     for k in (0, 5, 12):
         film.show(k)
-        (corners,) = polygons(ax)
+        (corners,) = rods(ax)
         centre, angle = thrown_pose(film.ts[k])
         np.testing.assert_allclose(corners.mean(axis=0), centre, atol=1e-12)
         np.testing.assert_allclose(np.tan(angle_of(corners)), np.tan(angle), rtol=1e-9)
-        (trail,) = segments(ax)
+        trail, _ = segments(ax)  # and the symbol of the motor
         np.testing.assert_allclose(trail[-1], centre, atol=1e-12)
         np.testing.assert_allclose(trail[0], [0.5, 0.0], atol=1e-12)
         assert any(x.get_text().startswith(f"t = {film.ts[k]:.2f} s") for x in ax.texts)
@@ -310,6 +317,15 @@ def test_the_reaction_of_a_hinge_is_plotted_with_units():
     # Of a level rod that is released: a quarter of its weight. The spring has its length.
     np.testing.assert_allclose(found.force[0], [0.0, 2.0 * G / 4], atol=1e-9)
     assert len(ax.figure.axes) == 1  # a hinge has no torque, only round-off
+
+
+def test_a_drive_without_a_force_has_its_torque_alone():
+    scene, sol = thrown()
+    ax = scene.plot_reactions(sol, "motor", units=UNITS)
+    assert (ax.get_ylabel(), len(ax.figure.axes)) == ("motor: torque [N m]", 1)
+    (line,) = ax.lines
+    inertia = 2.0 * 1.0**2 / 12
+    np.testing.assert_allclose(heights(line), inertia * SPIN_UP, rtol=1e-9)  # round-off
 
 
 def test_sweeps_plot_maps_and_lines_and_cross_what_failed():

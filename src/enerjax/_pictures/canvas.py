@@ -105,23 +105,34 @@ class AbstractCanvas(abc.ABC):
         """A small text beside a point."""
 
     def move_apart(self, texts: list[Any]) -> None:
-        """Moves texts around their points, so that none covers another. Those that find no
-        room are left out."""
+        """Moves texts around their points, so that none covers another, and into the axes
+        where there is room. Those that find no room are left out."""
         figure: Any = self.ax.figure
         figure.draw_without_rendering()
-        inside = self.ax.get_window_extent()
-        taken = np.zeros((0, 2, 2))
+        taken: list[Array] = []
         for text in texts:
-            for place in _PLACES:
-                text.set_position(place)
-                text.set_ha("left" if place[0] > 0 else "right")
-                corners = text.get_window_extent().get_points()
-                apart = (taken[:, 0] > corners[1]) | (taken[:, 1] < corners[0])
-                if apart.any(axis=1).all() and inside.contains(*corners.mean(axis=0)):
-                    taken = np.concatenate([taken, corners[None]])
-                    break
-            else:
+            found = self._free_places(text, taken)
+            if not found:
                 text.set_visible(False)
+                continue
+            # The first of those that are within the axes, or else the first of all.
+            place, box, _ = next((x for x in found if x[2]), found[0])
+            _put(text, place)
+            taken.append(box)
+
+    def _free_places(
+        self, text: Any, taken: list[Array]
+    ) -> list[tuple[tuple[int, int], Array, bool]]:
+        """The places of a text beside others, its corners there, and whether all of them
+        are within the axes."""
+        inside, found = self.ax.get_window_extent(), []
+        for place in _PLACES:
+            _put(text, place)
+            box = text.get_window_extent().get_points()
+            is_free = all((x[0] > box[1]).any() or (x[1] < box[0]).any() for x in taken)
+            if is_free and inside.contains(*box.mean(axis=0)):
+                found.append((place, box, all(inside.contains(*x) for x in box)))
+        return found
 
 
 class PlaneCanvas(AbstractCanvas):
@@ -244,6 +255,11 @@ class SpaceCanvas(AbstractCanvas):
 
 def _darker(color: Array) -> Array:
     return color * np.array([0.6, 0.6, 0.6, 1.0])
+
+
+def _put(text: Any, place: tuple[int, int]) -> None:
+    text.set_position(place)
+    text.set_ha("left" if place[0] > 0 else "right")
 
 
 def _annotate(ax: Axes, point: Array, text: str, color: Array) -> Any:

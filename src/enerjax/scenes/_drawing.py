@@ -157,22 +157,29 @@ def animate(
 def plot_reaction(
     sol: Solution, found: Reaction, joint: str, ax: Any, units: Units | None
 ) -> Axes:
-    """The components of a force and, on an axis at the right, of a torque."""
+    """The components of a force and of a torque, which has an axis at the right if both
+    are there."""
     rows, ax = ReachedRows(sol), axes_of(ax)
     force, torque = rows(found.force), rows(found.torque)
-    for k, column in enumerate(force.T):
-        ax.plot(rows.ts, column, f"C{k}", label=f"force {'xyz'[k]}")
-    ax.set(xlabel=label("time", units), ylabel=f"{joint}: {label('force', units)}")
-    handles = ax.get_lines()
-    # Of a pin without a torque there is round-off.
     largest = lambda x: float(np.max(np.abs(x)))
-    if largest(torque) > 1e-9 * largest(force) * largest(rows(sol.ys.q)):
-        beside: Any = ax.twinx()
+    arm = largest(rows(sol.ys.q))
+    # Of a pin without a torque there is round-off, and of an angle without a force.
+    has_torque = largest(torque) > 1e-9 * largest(force) * arm
+    has_force = largest(force) * arm > 1e-9 * largest(torque) or not has_torque
+    handles: list[Any] = []
+    if has_force:
+        for k, column in enumerate(force.T):
+            handles += ax.plot(rows.ts, column, f"C{k}", label=f"force {'xyz'[k]}")
+        ax.set_ylabel(f"{joint}: {label('force', units)}")
+    if has_torque:
+        beside: Any = ax.twinx() if has_force else ax
         names = ["torque"] if torque.shape[1] == 1 else [f"torque {x}" for x in "xyz"]
         for k, column in enumerate(torque.T):
-            beside.plot(rows.ts, column, f"C{k + 3}--", label=names[k])
-        beside.set_ylabel(label("torque", units))
-        handles = [*handles, *beside.get_lines()]
+            style = f"C{k + 3}--" if has_force else f"C{k}"
+            handles += beside.plot(rows.ts, column, style, label=names[k])
+        what = label("torque", units)
+        beside.set_ylabel(what if has_force else f"{joint}: {what}")
+    ax.set_xlabel(label("time", units))
     legend_above(ax, 3, handles)
     if rows.outcome:
         tell(ax, f"the run ends at t = {rows.ts[-1]:.4g}: {rows.outcome}")

@@ -378,7 +378,7 @@ class Scene:
         """The force and torque of a joint or drive over time; see `reaction`.
 
         `units` are names for the labels, such as `{"time": "s", "force": "N"}`; torques
-        have an axis at the right. **Returns:** the axes.
+        have an axis at the right if there are forces. **Returns:** the axes.
         """
         from ._drawing import plot_reaction
 
