@@ -244,8 +244,14 @@ class SpaceCanvas(AbstractCanvas):
             (ax.set_xlim, ax.set_ylim, ax.set_zlim), middle, size, strict=True
         ):
             set_limits(m - s / 2, m + s / 2)
-        ax.set_box_aspect(size, zoom=0.9)
-        ax.zaxis.labelpad = 10  # of the length of its ticks
+        for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
+            axis.labelpad = 10  # their ticks can be long
+        for zoom in (0.95, 0.9, 0.85, 0.8, 0.75):
+            ax.set_box_aspect(size, zoom=zoom)
+            ax.figure.draw_without_rendering()
+            room, needed = ax.figure.bbox, ax.get_tightbbox()
+            if room.x0 <= needed.x0 and needed.x1 <= room.x1:
+                break  # the labels of the axes are not cut off
 
     def write(self, point: Array, text: str, color: Array) -> Any:
         ax: Any = self.ax

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._types import Real
-from ..scenes import bodies, forces, joints, Scene
+from ..scenes import bodies, forces, joints, Scene, shapes
 from ._base import Problem, problem_of
 
 
@@ -208,9 +208,22 @@ def steady_top(precession: Real = 10.0) -> Problem:
         np.array([[1, 0, 0], [0, c, -s], [0, s, c]]),
         velocity=jnp.cross(turning, centre * axis),
         angular_velocity=turning,
+        shape=_cone(radius, height),
     )
     tip = joints.Spherical("tip", "ground", "top", [0.0, 0.0, 0.0])
     return problem_of(Scene([top, tip], gravity=[0.0, 0.0, -gravity]))
+
+
+def _cone(radius: float, height: float, sides: int = 32) -> shapes.Mesh:
+    """A cone about the third axis, whose tip points down; its mass centre is the origin."""
+    turn = 2 * np.pi * np.arange(sides) / sides
+    rim = np.stack([radius * np.cos(turn), radius * np.sin(turn), 0 * turn], axis=1)
+    centre = np.array([0.0, 0.0, 0.75 * height])
+    ends = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, height]])
+    vertices = np.concatenate([ends, rim + ends[1]]) - centre
+    pairs = [(2 + k, 2 + (k + 1) % sides) for k in range(sides)]
+    faces = [face for a, b in pairs for face in ((0, b, a), (1, a, b))]
+    return shapes.Mesh(vertices, faces)
 
 
 def tethered_body() -> Problem:
