@@ -267,6 +267,8 @@ def test_files_show_each_frame_for_its_time(tmp_path):
     assert np.mean(first != last) > 1e-3
     if shutil.which("ffmpeg"):
         assert film.save(tmp_path / "run.mp4", dpi=30).stat().st_size > 1000
+        with pytest.raises(RuntimeError, match="ffmpeg could not write"):
+            film.save(tmp_path / "missing" / "run.mp4", dpi=30)
 
 
 def test_a_film_of_points_needs_no_scene():

@@ -1,15 +1,17 @@
 """Pictures that move: files, and a player in notebooks."""
 
 import base64
+import contextlib
 import io
+import itertools
 import shutil
+import subprocess
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.animation import FFMpegWriter, FuncAnimation
 from matplotlib.artist import Artist
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -83,7 +85,8 @@ class Animation:
 
         MP4 needs the program ffmpeg.
 
-        **Raises:** `ValueError` for another suffix, `RuntimeError` without ffmpeg.
+        **Raises:** `ValueError` for another suffix, `RuntimeError` without ffmpeg, and if
+        it fails.
         """
         path = Path(path)
         suffix = path.suffix.lower()
@@ -161,19 +164,24 @@ class Animation:
         )
 
     def _save_mp4(self, path: Path, dpi: float) -> None:
-        def show(k: int) -> Sequence[Artist]:
-            self.show(k)
-            return self._moving
-
-        film = FuncAnimation(
-            self.figure,
-            show,
-            len(self.ts),
-            init_func=lambda: self._moving,
-            cache_frame_data=False,
-        )
-        fps: Any = self.fps  # annotated as an integer, which it need not be
-        film.save(path, FFMpegWriter(fps=fps), dpi=dpi)
+        frames = self._rendered(range(len(self.ts)), dpi)
+        first = next(frames)
+        height, width, _ = first.shape
+        size, form = f"{width}x{height}", ["-f", "rawvideo", "-pix_fmt", "rgb24"]
+        even = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]
+        source = [*form, "-s", size, "-r", str(self.fps), "-i", "pipe:0"]
+        with subprocess.Popen(
+            ["ffmpeg", "-y", "-loglevel", "error", *source, *even, str(path)],
+            stdin=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        ) as ffmpeg:
+            # It says why when it ends, whether or not it took the frames.
+            with contextlib.suppress(BrokenPipeError):
+                for frame in itertools.chain([first], frames):
+                    ffmpeg.stdin.write(frame)  # pyright: ignore[reportOptionalMemberAccess]
+            _, errors = ffmpeg.communicate()
+        if ffmpeg.returncode != 0:
+            raise RuntimeError(f"ffmpeg could not write {path}: {errors.decode().strip()}")
 
     def _player(self, dpi: float) -> str:
         sources = []
