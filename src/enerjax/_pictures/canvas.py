@@ -249,8 +249,8 @@ class SpaceCanvas(AbstractCanvas):
         for zoom in (0.95, 0.9, 0.85, 0.8, 0.75):
             ax.set_box_aspect(size, zoom=zoom)
             ax.figure.draw_without_rendering()
-            room, needed = ax.figure.bbox, ax.get_tightbbox()
-            if room.x0 <= needed.x0 and needed.x1 <= room.x1:
+            room, needed = (x.get_points() for x in (ax.figure.bbox, ax.get_tightbbox()))
+            if np.all(room[0] <= needed[0]) and np.all(needed[1] <= room[1]):
                 break  # the labels of the axes are not cut off
 
     def write(self, point: Array, text: str, color: Array) -> Any:

@@ -127,7 +127,9 @@ def _size(motion: Motion) -> float:
             own.append(float(np.ptp(points, axis=0).max()))
     ends = [x[:1] for link in motion.links for x in (link.start, link.end)]
     extent = float(np.ptp(np.concatenate([*clouds, *ends]), axis=0).max())
-    few = 8 * float(np.median(own))
+    spans = [np.linalg.norm(x.end[0] - x.start[0]) for x in motion.links]
+    longer = [float(x) for x in spans if x > 0]  # point masses are small beside springs
+    few = 8 * max(float(np.median(x)) for x in (own, longer or [0.0]))
     return min((x for x in (extent, few) if x > 0), default=1.0)
 
 
