@@ -173,7 +173,8 @@ def test_bodies_in_space_have_their_shapes_and_colours_in_perspective():
     ax.figure.draw_without_rendering()
     assert (ax.get_xlabel(), ax.get_zlabel()) == ("x [m]", "z [m]")
     low, high = ax.get_tightbbox().get_points()  # with the labels: none is cut off
-    assert np.all(low >= 0) and np.all(high <= ax.figure.bbox.size)
+    assert np.all(low >= 0)
+    assert np.all(high <= ax.figure.bbox.size)
     paths = ax.collections[0].get_paths()  # of all faces, projected
     colors = ax.collections[0].get_facecolor()[:, :3]
     is_red = (colors[:, 0] > 0.3) & (colors[:, 1:] < 1e-3).all(axis=1)
