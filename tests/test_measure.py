@@ -90,7 +90,9 @@ def test_the_results_can_be_plotted():
     import matplotlib.pyplot as plt
 
     for measured in (orders(), against_data()):
-        grid = measured.plot()
+        given = plt.subplots(1, 2)[1]
+        grid = measured.plot(given)
+        assert [*grid] == [*given]
         assert [len(axes.lines) for axes in grid] == [2, 2]
         plt.close("all")
 

@@ -35,7 +35,7 @@ def checked(ax: Any) -> Axes:
 
 
 def grid_of(axes: Any, rows: int, figsize: tuple[float, float]) -> np.ndarray:
-    """`axes` as a flat array, or new ones in some rows of two.
+    """`axes` as a flat array, or new ones in this number of rows, two in each.
 
     **Raises:** `ValueError` for another number of axes.
     """

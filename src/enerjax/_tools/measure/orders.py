@@ -58,8 +58,10 @@ class OrderTable:
         return with_uncertainty(rows, self.uncertainty)
 
     def plot(self, axes: Any = None) -> Any:
-        """Errors of positions and velocities against the step, in two axes, which are
-        returned."""
+        """Errors of positions and velocities against the step.
+
+        `axes` are two axes of matplotlib, by default new ones. **Returns:** the axes.
+        """
         from ..._pictures import grid_of
 
         axes = grid_of(axes, 1, (10.0, 4.0))

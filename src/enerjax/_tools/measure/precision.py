@@ -77,8 +77,10 @@ class WorkPrecision:
         return with_uncertainty(rows, self.uncertainty)
 
     def plot(self, axes: Any = None) -> Any:
-        """Error of the positions against time and against corrections, in two axes, which
-        are returned."""
+        """Error of the positions against time and against corrections.
+
+        `axes` are two axes of matplotlib, by default new ones. **Returns:** the axes.
+        """
         from ..._pictures import grid_of
 
         axes = grid_of(axes, 1, (10.0, 4.0))
