@@ -2,7 +2,9 @@
 
 import dataclasses
 import functools
+import itertools
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -15,6 +17,7 @@ import numpy as np
 import pytest
 
 import enerjax as ej
+from enerjax._run import long_run
 
 from .helpers import EPS, problem, SCHEMES
 from .long_process import motion, STEPS
@@ -96,8 +99,10 @@ def test_a_killed_run_is_continued(tmp_path):
     assert calls[0][0] > 0.01 * int(part.stats.completed_steps)
     # The file holds the whole run now, so the same call makes no step.
     calls.clear()
+    written = file.stat().st_mtime_ns
     assert_same(motion(checkpoint=file, progress=lambda *times: calls.append(times)), found)
     assert calls == []
+    assert file.stat().st_mtime_ns == written
     assert_same(ej.load(file), found)
 
 
@@ -134,6 +139,42 @@ def test_progress_is_shown_on_one_line(capsys):
     first, *_, last = capsys.readouterr().err.splitlines()
     assert "time 0.64 of 7, 64 steps" in first
     assert last.startswith("100 % [####################] time 7 of 7, 700 steps")
+
+
+def test_a_terminal_overwrites_the_line(capsys, monkeypatch):
+    """The time left is that at the speed since the first report. Here the clock advances
+    by a second whenever it is read, which is twice for each report."""
+    clock = itertools.count()
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setattr("time.monotonic", lambda: float(next(clock)))
+    motion(num_steps=700, progress=True)
+    lines = capsys.readouterr().err
+    assert lines.count("\n") == 1
+    _, first, second, *_, last = lines.split("\r")
+    assert first.rstrip().endswith("64 steps")
+    done, left = re.findall(r"time (\S+) of .* 0:(\d+) left", second)[0]
+    assert int(left) == round(2 * (7 - float(done)) / (float(done) - 0.64))
+    assert last.startswith("100 %")
+    assert last.rstrip().endswith(" passed")
+
+
+def test_an_interrupted_run_ends_its_line(capsys, monkeypatch):
+    """As by Ctrl-C in the second piece."""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    pieces = itertools.count(1)
+    made = long_run._LongRun.go_on
+
+    def go_on(*args):
+        if next(pieces) == 2:
+            raise KeyboardInterrupt
+        return made(*args)
+
+    monkeypatch.setattr(long_run._LongRun, "go_on", go_on)
+    with pytest.raises(KeyboardInterrupt):
+        motion(num_steps=700, progress=True)
+    last = capsys.readouterr().err.split("\r")[-1]
+    assert "time 0.64 of 7, 64 steps" in last
+    assert last.endswith("\n")
 
 
 def test_progress_is_called_with_times():

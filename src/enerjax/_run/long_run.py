@@ -231,17 +231,18 @@ def checked_wishes(
 def run_long(task: Task, num_rows: int, wishes: Wishes) -> tuple[Solution, Scalar]:
     """The solution, of an interrupted run that so far, and the time that is reached."""
     run, file = _LongRun(task, num_rows), wishes.checkpoint
-    sofar = run.first
+    sofar, in_file = run.first, None
     if file is not None and file.path.exists():
         # The file may be further than the solution that this run was continued from.
-        sofar = run.continued(load(file.path), f"The file {file.path}")
+        sofar = in_file = run.continued(load(file.path), f"The file {file.path}")
     elif wishes.resume is not None:
         sofar = run.continued(wishes.resume, "`resume`")
-    report, attempts = _reporter(run, wishes.progress, sofar), _FIRST_ATTEMPTS
+    report, attempts = _reporter(run, wishes.progress), _FIRST_ATTEMPTS
     try:
         while not run.is_finished(sofar):
-            if file is not None and file.is_due:
+            if file is not None and file.is_due and sofar is not in_file:
                 file.write(run.solution(sofar)[0])
+                in_file = sofar
             begin, before = time.perf_counter(), run.attempts(sofar)
             sofar = run.go_on(sofar, attempts)
             speed = (run.attempts(sofar) - before) / (time.perf_counter() - begin)
@@ -249,32 +250,51 @@ def run_long(task: Task, num_rows: int, wishes: Wishes) -> tuple[Solution, Scala
             report(sofar)
     except KeyboardInterrupt:
         # The result of the solution tells.
-        pass
+        if isinstance(report, _Bar):
+            report.end(sofar)
     solution, reached = run.solution(sofar)
-    if file is not None:
+    if file is not None and sofar is not in_file:
         file.write(solution)
     return solution, reached
 
 
-def _reporter(run: _LongRun, progress: Progress, first: _Sofar) -> Callable[[_Sofar], None]:
+def _reporter(run: _LongRun, progress: Progress) -> Callable[[_Sofar], None]:
     if callable(progress):
         return lambda sofar: progress(*run.times(sofar))
-    if not progress:
-        return lambda sofar: None
-    line, begin, (before, _) = Line(pause=10.0), time.monotonic(), run.times(first)
+    return _Bar(run) if progress else lambda sofar: None
 
-    def show(sofar: _Sofar) -> None:
-        done, whole = run.times(sofar)
-        passed = time.monotonic() - begin
-        left = passed * (whole - done) / max(done - before, 1e-300)
-        bar = f"{'#' * int(20 * done / whole):20}"
-        line.show(
-            f"{100 * done / whole:3.0f} % [{bar}] time {done:.5g} of {whole:.5g}, "
-            f"{_completed(sofar):,} steps, {_clock(passed)} passed, {_clock(left)} left",
-            is_last=run.is_finished(sofar),
+
+class _Bar:
+    """How far a run is, and how long it may still take, on one line."""
+
+    def __init__(self, run: _LongRun):
+        self._run = run
+        self._line = Line(pause=10.0)
+        self._begin: tuple[float, float] | None = None
+
+    def __call__(self, sofar: _Sofar) -> None:
+        self._show(sofar, self._run.is_finished(sofar))
+
+    def end(self, sofar: _Sofar) -> None:
+        """Ends the line of an interrupted run."""
+        self._show(sofar, is_last=True)
+
+    def _show(self, sofar: _Sofar, is_last: bool) -> None:
+        (done, whole), now = self._run.times(sofar), time.monotonic()
+        if self._begin is None:
+            # Speed is measured from here: a run that is continued did not start now.
+            self._begin = now, done
+        begin, before = self._begin
+        text = (
+            f"{100 * done / whole:3.0f} % [{'#' * int(20 * done / whole):20}] "
+            f"time {done:.5g} of {whole:.5g}, {_completed(sofar):,} steps"
         )
-
-    return show
+        if is_last:
+            text += f", {_clock(now - begin)} passed"
+        elif done > before:
+            left = (now - begin) * (whole - done) / (done - before)
+            text += f", {_clock(left)} left"
+        self._line.show(text, is_last)
 
 
 def _clock(seconds: float) -> str:
