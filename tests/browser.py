@@ -18,6 +18,11 @@ FLAGS = (
     "--enable-unsafe-swiftshader", "--remote-debugging-port=0", "--no-first-run",
     "--disable-extensions", "--disable-background-networking",
 )  # fmt: skip
+_FRAMES = """new Promise(done => {
+    let left = 3;
+    const next = () => left-- > 0 ? requestAnimationFrame(next) : done();
+    next();
+})"""
 PATIENCE = 240  # seconds; a page in software on a busy machine is slow
 
 
@@ -44,7 +49,8 @@ class Page:
                 return answer["result"]
 
     def evaluate(self, script):
-        found = self.call("Runtime.evaluate", expression=script, returnByValue=True)
+        asked = dict(expression=script, returnByValue=True, awaitPromise=True)
+        found = self.call("Runtime.evaluate", **asked)
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
@@ -55,22 +61,39 @@ class Page:
             assert time.monotonic() < end, f"{script} was not true in {PATIENCE} s"
             time.sleep(0.1)
 
+    def press_space(self):
+        for kind in ("keyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, key=" ", code="Space")
+
     def press(self, x, y, *, to=None):
         """Presses the mouse button at a place; drags to another if there is one."""
         mouse = lambda kind, x, y: self.call(
             "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1
         )
+        # The page handles what happens within one frame as one event: a short click can
+        # be none.
         mouse("mousePressed", x, y)
+        self.evaluate(_FRAMES)
         if to is not None:
             for part in (0.5, 1.0):
                 mouse("mouseMoved", x + part * (to[0] - x), y + part * (to[1] - y))
+                self.evaluate(_FRAMES)
         mouse("mouseReleased", *(to or (x, y)))
+        self.evaluate(_FRAMES)
 
     def picture(self):
-        """What is seen, as an array of shape (height, width, 3)."""
+        """What is seen in a few frames from now, as an array `(height, width, 3)`."""
+        self.evaluate(_FRAMES)
         data = self.call("Page.captureScreenshot", format="png")["data"]
         image = Image.open(io.BytesIO(base64.b64decode(data)))
         return np.asarray(image.convert("RGB")).astype(int)
+
+    def settled(self):
+        """What is seen when it does not change any more."""
+        end, seen = time.monotonic() + PATIENCE, self.picture()
+        while not np.array_equal(seen, seen := self.picture()):
+            assert time.monotonic() < end, "the picture does not come to rest"
+        return seen
 
 
 @contextlib.contextmanager
@@ -78,8 +101,7 @@ def open_page(file, folder, size):
     """A page with a file, in a window of this size; `folder` is for the browser's own."""
     from websockets.sync.client import connect  # pyright: ignore
 
-    window = f"--window-size={size[0]},{size[1]}"
-    command = [CHROMIUM, *FLAGS, window, f"--user-data-dir={folder}", "about:blank"]
+    command = [CHROMIUM, *FLAGS, f"--user-data-dir={folder}", "about:blank"]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
     try:
         port, end = folder / "DevToolsActivePort", time.monotonic() + PATIENCE
@@ -92,6 +114,8 @@ def open_page(file, folder, size):
             page = Page(socket)
             for domain in ("Page", "Network", "Runtime"):
                 page.call(f"{domain}.enable")
+            screen = dict(width=size[0], height=size[1], deviceScaleFactor=1, mobile=False)
+            page.call("Emulation.setDeviceMetricsOverride", **screen)
             page.call("Page.navigate", url=file.as_uri())
             yield page
     finally:
