@@ -96,10 +96,9 @@ def test_a_scene_in_the_plane_stands_upright():
     The floor of the scene takes the place of the grid."""
     rod = ej.bodies.PlanarBody.rod("rod", 1.0, [0.0, 1.0], [0.0, 3.0])
     floor = ej.shapes.Box([4.0, 0.1])
-    scene = ej.Scene(
-        [rod, ej.forces.Spring("s", "ground", "rod", 1.0, point_a=[2.0, 0.0])], ground=floor
-    )
-    messages, _ = contents(scene.view())
+    spring = ej.forces.Spring("s", "ground", "rod", 1.0, point_a=[2.0, 0.0])
+    hinge = ej.joints.Revolute("hinge", "ground", "rod", [0.0, 1.0])
+    messages, _ = contents(ej.Scene([rod, hinge, spring], ground=floor).view())
     _, places = track(messages, "/1 rod", "SetPositionMessage")
     assert np.allclose(places[0, [0, 2]], [0.0, 2.0])
     assert abs(places[0, 1]) < 0.1
@@ -109,6 +108,10 @@ def test_a_scene_in_the_plane_stands_upright():
     assert np.allclose(turned[:, [0, 2]], [[0, 0], [0, -1], [1, 0]], atol=1e-12)
     names = {m.get("name") for _, m in messages}
     assert "/s" in names
+    # A pin and its bearing, about the normal of the plane.
+    assert {"/2 hinge/0 surface", "/2 hinge/1 surface"} <= names
+    _, pins = track(messages, "/2 hinge", "SetPositionMessage")
+    assert np.allclose(pins[0], [0.0, 0.0, 1.0])
     assert "/grid" not in names
 
 

@@ -8,13 +8,16 @@ from scipy.sparse.csgraph import connected_components
 
 from ._frames import GROUND
 from ._motion import Array, BodyMotion, LinkMotion, Motion
-from .shapes import AbstractShape, Mesh, Polyline
+from .shapes import AbstractShape, Cylinder, Mesh, Polyline
 
 
 # Edges are sharp from this angle between their sides on (radians).
 _SHARP = 0.5
 # The thickness of a flat body over the size of an average one, and the order of layers.
 _SLAB, _LAYERS = 0.04, 3
+# The radii of a pin and of its bearing on the ground, over this thickness.
+_PIN, _BEARING = 0.6, 1.6
+_DARK, _PALE = (0.2, 0.2, 0.2, 1.0), (0.6, 0.6, 0.6, 1.0)
 # From the plane to space: x to the right, y up, and the third axis towards the viewer.
 _UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
@@ -63,7 +66,7 @@ def _patches(points: Array, faces: Array) -> Array:
 
 
 def upright(motion: Motion) -> Motion:
-    """A motion in the plane as one in space, of flat bodies in layers."""
+    """A motion in the plane as one in space, of flat bodies in layers, held by pins."""
     sizes = [
         np.ptp(shape.facets().points, axis=0).max()
         for body in motion.bodies
@@ -71,8 +74,11 @@ def upright(motion: Motion) -> Motion:
         if body.name != GROUND
     ]
     thick = _SLAB * float(np.median(sizes)) if sizes else 0.0
-    bodies = tuple(_stood(body, k, thick) for k, body in enumerate(motion.bodies))
-    return motion._replace(bodies=bodies, links=tuple(map(_stood_link, motion.links)))
+    bodies = [_stood(body, k, thick) for k, body in enumerate(motion.bodies)]
+    links = tuple(map(_stood_link, motion.links))
+    if thick > 0:
+        bodies += [_pin(link, thick) for link in links if link.symbol == "pin"]
+    return motion._replace(bodies=tuple(bodies), links=links)
 
 
 def _in_space(x: Array) -> Array:
@@ -97,6 +103,17 @@ def _stood(body: BodyMotion, number: int, thick: float) -> BodyMotion:
 def _stood_link(link: LinkMotion) -> LinkMotion:
     start, end, *axes = map(_in_space, (link.start, link.end, *link.axes))
     return link._replace(start=start, end=end, axes=tuple(axes))
+
+
+def _pin(link: LinkMotion, thick: float) -> BodyMotion:
+    """The pin of a hinge, through all layers; on the ground it has a bearing behind."""
+    middle = [0.0, 0.0, 0.0]
+    shapes = [Cylinder(_PIN * thick, (_LAYERS + 0.5) * thick, middle, color=_DARK)]
+    if GROUND in link.bodies:
+        behind = [0.0, 0.0, -2.5 * thick]
+        shapes.append(Cylinder(_BEARING * thick, thick, behind, color=_PALE))
+    rotation = np.broadcast_to(_UPRIGHT, (len(link.end), 3, 3))
+    return BodyMotion(link.name, tuple(shapes), link.end, rotation)
 
 
 def _thickened(shape: AbstractShape, thick: float) -> list[AbstractShape]:
