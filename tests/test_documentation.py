@@ -1,5 +1,6 @@
 """The code in the documentation runs, links lead somewhere, and lists are complete."""
 
+import importlib.util
 import operator
 import pathlib
 import re
@@ -19,10 +20,14 @@ PAGES = [HOME / "README.md", *sorted(DOCS.glob("*.md")), *API]
 NAVIGATION = re.findall(r"([\w/-]+\.md)$", (HOME / "mkdocs.yml").read_text(), re.MULTILINE)
 
 
-# Blocks that are marked with `no-run` need an optional extra, or compile for most of a
-# minute what other tests run already.
+def runs(mark):
+    """Whether a block with this mark is run. `no-run` marks what compiles for most of a
+    minute and is run by other tests, `needs NAME ...` what needs optional packages."""
+    return mark != "no-run" and all(map(importlib.util.find_spec, mark.split()[1:]))
+
+
 def with_code():
-    pages = [page for page in PAGES if any(not mark for mark, _ in code_blocks(page))]
+    pages = [page for page in PAGES if any(runs(mark) for mark, _ in code_blocks(page))]
     # The scheme of this page is a file of the tests, which others run.
     return long(pages, *(x for x in pages if x.name == "write-your-own-scheme.md"))
 
@@ -33,7 +38,7 @@ def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = {}
     for mark, code in code_blocks(page):
-        if not mark:
+        if runs(mark):
             exec(compile(code, str(page), "exec"), names)
     plt.close("all")
     if page.name == "pictures.md":
@@ -42,13 +47,18 @@ def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
 
 
 def test_every_mark_is_known():
-    assert {mark for page in PAGES for mark, _ in code_blocks(page)} <= {"", "no-run"}
+    marks = {mark for page in PAGES for mark, _ in code_blocks(page)}
+    optional = ["mujoco", "pandas", "viser", "xarray"]
+    for mark in marks - {"", "no-run"}:
+        needs, *names = mark.split()
+        assert needs == "needs"
+        assert {*names} <= {*optional}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_code_that_is_not_run_is_valid(page):
     for mark, code in code_blocks(page):
-        if mark:
+        if not runs(mark):
             compile(code, str(page), "exec")
 
 
