@@ -32,8 +32,9 @@ SUITE = (
 )  # fmt: skip
 IGNORED = ("actuators", "contacts", "couplings", "fluid", "friction", "limits", "tendons")
 END, STEPS = 0.5, 500
-# The steps of the reference; half of it changes the positions by less than 1e-9.
-FINE = 1e-4
+# The step of the reference. Light bodies with dampers need it to be so short: explicit
+# schemes are unstable with longer ones.
+FINE = 1e-5
 
 
 @dataclasses.dataclass(frozen=True)
