@@ -28,7 +28,7 @@ import enerjax as ej
 
 SUITE = (
     "pendulum", "acrobot", "cartpole", "reacher", "hopper", "walker", "cheetah", "fish",
-    "manipulator", "humanoid",
+    "manipulator", "finger",
 )  # fmt: skip
 IGNORED = ("actuators", "contacts", "couplings", "fluid", "friction", "limits", "tendons")
 END, STEPS = 0.5, 500
@@ -194,13 +194,14 @@ def main() -> None:
     names = [options.only] if options.only else SUITE
     paths = [options.suite / f"{name}.xml" for name in names] + options.files
     rows = []
+    options.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         for path in paths:
             rows.append(measure(path, Path(folder)))
             show(rows[-1:])
+            # The next model may take long.
+            harness.write_csv(rows, options.out / "imported_models.csv")
     show(rows)
-    options.out.mkdir(parents=True, exist_ok=True)
-    harness.write_csv(rows, options.out / "imported_models.csv")
 
 
 if __name__ == "__main__":
