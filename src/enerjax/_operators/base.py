@@ -219,6 +219,14 @@ class AbstractModel(eqx.Module):
         """
 
     @abc.abstractmethod
+    def inverse_regular_metric(self, state: State) -> Symmetric:
+        """The inverse of a regular metric of `State.v`.
+
+        It is the metric for those `State.v` that the constraints between the axes of rigid
+        bodies admit. The metric itself is singular for a flat body.
+        """
+
+    @abc.abstractmethod
     def stiffness(
         self, state: State, multipliers: Multipliers
     ) -> tuple[Float[Array, "nq nq"] | Assembled, Symmetric]:

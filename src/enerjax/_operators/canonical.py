@@ -191,6 +191,9 @@ class CanonicalModel(AbstractModel):
     def inverse_metric(self, state: State) -> Float[Array, "nv nv"]:
         return self.metric(state)
 
+    def inverse_regular_metric(self, state: State) -> Float[Array, "nv nv"]:
+        return self.inverse_metric(state)
+
     def stiffness(
         self, state: State, multipliers: Multipliers
     ) -> tuple[Float[Array, "nq nq"], Float[Array, "nq nq"]]:

@@ -22,10 +22,7 @@ def direction_without_symmetry(x: Float[Array, " n"]) -> Float[Array, " n"]:
 @compiled
 def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]:
     inertia = system.inertia(state, args)
-    blocks, eps = blocks_of(inertia), 1e3 * jnp.finfo(inertia.dtype).eps
-    masses = jnp.diagonal(blocks, axis1=1, axis2=2)
-    root = jnp.sqrt(jnp.where(masses > 0, masses, 1))
-    scaled = blocks / (root[:, :, None] * root[:, None, :])
+    blocks, eps = _scaled_blocks(inertia), 1e3 * jnp.finfo(inertia.dtype).eps
     finite = lambda tree: jnp.all(
         jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(tree)], bool)
     )
@@ -54,10 +51,37 @@ def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]
         depends=jnp.array(system.redundant) | jnp.all(slopes != 0),
         inertia=finite(inertia),
         quadratic=_is_quadratic(system, state, inertia, args),
-        symmetric=jnp.all(jnp.abs(scaled - jnp.swapaxes(scaled, 1, 2)) <= eps),
-        definite=jnp.all(masses > 0) & finite(jnp.linalg.cholesky(scaled)),
+        symmetric=jnp.all(jnp.abs(blocks - jnp.swapaxes(blocks, 1, 2)) <= eps),
+        definite=_is_definite(system, state, inertia),
         rigid=_is_rigid(system, state, inertia, args),
     )
+
+
+def _scaled_blocks(matrix: Symmetric) -> Float[Array, "blocks size size"]:
+    """The blocks of a matrix, with ones on the diagonal where that is positive."""
+    blocks = blocks_of(matrix)
+    masses = jnp.diagonal(blocks, axis1=1, axis2=2)
+    largest = jnp.max(jnp.abs(masses))
+    root = jnp.sqrt(jnp.where(masses > 0, masses, jnp.where(largest > 0, largest, 1)))
+    return blocks / (root[:, :, None] * root[:, None, :])
+
+
+def _is_positive_definite(matrix: Symmetric, margin: float = 0.0) -> Array:
+    """Whether all eigenvalues of a matrix, scaled to a unit diagonal, exceed `-margin`."""
+    blocks = _scaled_blocks(matrix)
+    shifted = blocks + margin * jnp.eye(blocks.shape[1], dtype=blocks.dtype)[None]
+    is_positive = jnp.diagonal(shifted, axis1=1, axis2=2) > 0
+    return jnp.all(is_positive) & jnp.all(jnp.isfinite(jnp.linalg.cholesky(shifted)))
+
+
+def _is_definite(system: AbstractSystem, state: State, inertia: Symmetric) -> Array:
+    """Whether each velocity that the coordinates can have has a positive energy."""
+    if not isinstance(system, System):
+        return _is_positive_definite(inertia)
+    regular = system.kinematics.regular_inertia(state.q, inertia)
+    if regular is inertia:
+        return _is_positive_definite(inertia)
+    return _is_positive_definite(regular) & _is_positive_definite(inertia, 1e-9)
 
 
 def _is_quadratic(
@@ -84,6 +108,29 @@ def _is_rigid(
         return jnp.array(True)
     energy = lambda v: system.kinetic_energy(State(state.q, v), args)
     return system.kinematics.has_inertia(energy, inertia)
+
+
+def check_without_rotations(
+    system: AbstractSystem, state: State, args: Args, scheme: str
+) -> None:
+    """Raises an error for a flat body in a scheme that moves no bodies by rotations."""
+    if not isinstance(system, System):
+        return
+    if system.kinematics.with_rotations(state.q) is system.kinematics:
+        return
+    is_regular = _is_regular(system, state, args)
+    if is_known(is_regular) and not is_regular:
+        raise ValueError(
+            f"`{scheme}` takes the axes of rigid bodies as coordinates, and a body of this "
+            "system is flat: it has no inertia along one of its axes. Give it a thickness, "
+            "or use a scheme that moves bodies by rotations: `EnergyPreserving`, "
+            "`EnergyDecaying`, or `Composed` of the first."
+        )
+
+
+@compiled
+def _is_regular(system: System, state: State, args: Args) -> Array:
+    return _is_positive_definite(system.inertia(state, args))
 
 
 def check_values(system: AbstractSystem, state: State, args: Args) -> None:

@@ -124,6 +124,11 @@ class AbstractKinematics(eqx.Module):
         """`M`, which is constant. `of_user` returns that of the user's velocities."""
 
     @abc.abstractmethod
+    def regular_inertia(self, q: Coordinates, inertia: Symmetric) -> Symmetric:
+        """A regular matrix with the energy of `inertia` for velocities that satisfy
+        `constraint`, and with more for others."""
+
+    @abc.abstractmethod
     def metric(
         self, q: Coordinates, inertia: Symmetric, relations: Relations, args: Args
     ) -> Symmetric:

@@ -52,6 +52,9 @@ class ConfigurationKinematics(AbstractFlatKinematics):
     def constraint(self, q):
         return q[:0]
 
+    def regular_inertia(self, q, inertia):
+        return inertia
+
     def metric(self, q, inertia, relations, args):
         # It is `L^T M L + m sum_i b_i b_i^T`, with the normalised gradients `b_i` of the
         # coordinate constraints. `m` is the mean inertia of a coordinate, so the result

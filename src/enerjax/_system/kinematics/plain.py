@@ -19,7 +19,7 @@ class AbstractPlainKinematics(AbstractFlatKinematics):
         return self
 
     def metric(self, q, inertia, relations, args):
-        return inertia
+        return self.regular_inertia(q, inertia)
 
     def frames(self, q, jacobian, args):
         return None
@@ -57,3 +57,6 @@ class IdentityKinematics(AbstractPlainKinematics):
 
     def constraint(self, q):
         return q[:0]
+
+    def regular_inertia(self, q, inertia):
+        return inertia

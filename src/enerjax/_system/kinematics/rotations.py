@@ -103,6 +103,9 @@ class RigidKinematics(AbstractKinematics):
         at_rest = jnp.zeros((bodies.num_velocities,), dtype)
         return hessian(lambda v: energy(self.user_velocity(q, v)), at_rest, together)
 
+    def regular_inertia(self, q, inertia):
+        return inertia
+
     def metric(self, q, inertia, relations, args):
         return inertia
 
