@@ -546,10 +546,23 @@ def test_the_modes_of_a_hanging_plate_are_those_of_two_pendulums():
 
 def test_schemes_without_rotations_refuse_flat_bodies():
     system, args = flat_system("plate")
-    with pytest.raises(ValueError, match="`EnergyConsistent` takes the axes .* is flat"):
-        ej.simulate(
-            system, ej.EnergyConsistent(0.0), turning(SPEED), args, h=0.01, num_steps=1
-        )
+    for scheme in (ej.EnergyConsistent(0.0), ej.Composed(ej.Rattle(), 4)):
+        name = type(scheme.stage).__name__
+        with pytest.raises(ValueError, match=f"`{name}` takes the axes .* is flat"):
+            ej.simulate(system, scheme, turning(SPEED), args, h=0.01, num_steps=1)
+
+
+def test_one_flat_body_of_many_is_found_whatever_its_axes_are():
+    """Its least second moment is round-off, and not zero."""
+    to_axes = Rotation.from_rotvec([0.2, 0.5, 0.9]).as_matrix()
+    inertias = [np.diag(MOMENTS), to_axes @ np.diag(PLATE) @ to_axes.T, np.diag(MOMENTS)]
+    bodies = [
+        ej.bodies.RigidBody(f"body{k}", 2.0, (x + x.T) / 2, [k, 0.0, 0.0])
+        for k, x in enumerate(inertias)
+    ]
+    system, start, args = ej.Scene(bodies).build()
+    with pytest.raises(ValueError, match="`Rattle` takes the axes .* is flat"):
+        ej.simulate(system, ej.Rattle(), start, args, h=0.01, num_steps=1)
 
 
 # Places in scattered order: the vectors of the body, last director first, are interleaved.
@@ -790,7 +803,13 @@ def test_kinetic_energies_that_no_rigid_body_has_are_errors(kinetic):
 
 
 @pytest.mark.parametrize(
-    ("moments", "is_right"), [((1, 1, 2), True), ((1, 1, 3), False), ((0, 1, 1), False)]
+    ("moments", "is_right"),
+    [
+        ((1, 1, 2), True),
+        ((1, 1, 3), False),
+        ((0, 1, 1), False),
+        ((1e-12, 1, 1), False),
+    ],
 )
 def test_moments_that_no_rigid_body_has_are_errors(moments, is_right):
     """Those of a plate are right; a negative second moment and an axis without are not."""

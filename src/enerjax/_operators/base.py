@@ -423,7 +423,7 @@ class AbstractModel(eqx.Module):
         multipliers minimise.
         """
         q = state.q
-        step = jnp.sqrt(self.metric(state).diagonal())
+        step = self.step_scale(state)
         coordinate = self.coordinate_scale(step)
         rows = lambda q: self.constraint(q, state.t)
         pattern = RowPattern(rows, q)
@@ -438,6 +438,10 @@ class AbstractModel(eqx.Module):
         constraint = jnp.where(constraint > 0, constraint, 1.0)
         scales = Scales(coordinate, step, constraint, size)
         return scales if self.system.redundant else jax.lax.stop_gradient(scales)
+
+    @abc.abstractmethod
+    def step_scale(self, state: State) -> Increments:
+        """The scales of the rates of an increment."""
 
     @abc.abstractmethod
     def coordinate_scale(self, step: Increments) -> Coordinates:

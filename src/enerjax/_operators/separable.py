@@ -346,6 +346,10 @@ class SeparableModel(AbstractModel):
         regular = self.kinematics.regular_inertia(state.q, self.inertia)
         return self.inverse_inertia if regular is self.inertia else inverse_of(regular)
 
+    def step_scale(self, state: State) -> Increments:
+        kind, relations = self.kinematics, self.coordinate
+        return kind.step_scale(state.q, self.inertia, relations, self.args)
+
     def coordinate_scale(self, step: Increments) -> Coordinates:
         return self.kinematics.coordinate_scale(step)
 
@@ -438,8 +442,7 @@ class SeparableModel(AbstractModel):
         if gyroscopic is not None:
             slope = slope + gyroscopic
         free_rate = self._free_joint_acceleration(state, qdot)
-        regular = self.kinematics.regular_inertia(q, self.inertia)
-        unit = 1 / jnp.sqrt(regular.diagonal())
+        unit = 1 / self.kinematics.velocity_scale(self.inertia)
 
         def conditions(x: Array) -> Array:
             acceleration, multipliers = unit * x[: v.size], x[v.size :] / scales.constraint

@@ -73,7 +73,7 @@ def prepare(
     if is_known((system, start, args)) and not isinstance(
         scheme.stage, AbstractSchemeWithRotations
     ):
-        check_without_rotations(system, start, args, type(scheme).__name__)
+        check_without_rotations(system, start, args, type(scheme.stage).__name__)
     if is_known((scheme, system, start, args)):
         check_derivatives(scheme, system, start, args)
     return start, args, h, jnp.asarray(t, h.dtype)

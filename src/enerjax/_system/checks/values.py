@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..._programs import compiled, is_known
-from ..._solvers import blocks_of, Symmetric
-from ..._types import Args
+from ..._solvers import is_positive_definite, scaled_blocks, Symmetric
+from ..._types import Args, Flag
 from ..base import AbstractSystem, State
 from ..canonical import HamiltonianSystem, LagrangianSystem
 from ..separable import System
@@ -22,7 +22,7 @@ def direction_without_symmetry(x: Float[Array, " n"]) -> Float[Array, " n"]:
 @compiled
 def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]:
     inertia = system.inertia(state, args)
-    blocks, eps = _scaled_blocks(inertia), 1e3 * jnp.finfo(inertia.dtype).eps
+    blocks, eps = scaled_blocks(inertia), 1e3 * jnp.finfo(inertia.dtype).eps
     finite = lambda tree: jnp.all(
         jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(tree)], bool)
     )
@@ -52,36 +52,23 @@ def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]
         inertia=finite(inertia),
         quadratic=_is_quadratic(system, state, inertia, args),
         symmetric=jnp.all(jnp.abs(blocks - jnp.swapaxes(blocks, 1, 2)) <= eps),
-        definite=_is_definite(system, state, inertia),
+        **_definiteness(system, inertia),
         rigid=_is_rigid(system, state, inertia, args),
     )
 
 
-def _scaled_blocks(matrix: Symmetric) -> Float[Array, "blocks size size"]:
-    """The blocks of a matrix, with ones on the diagonal where that is positive."""
-    blocks = blocks_of(matrix)
-    masses = jnp.diagonal(blocks, axis1=1, axis2=2)
-    largest = jnp.max(jnp.abs(masses))
-    root = jnp.sqrt(jnp.where(masses > 0, masses, jnp.where(largest > 0, largest, 1)))
-    return blocks / (root[:, :, None] * root[:, None, :])
-
-
-def _is_positive_definite(matrix: Symmetric, margin: float = 0.0) -> Array:
-    """Whether all eigenvalues of a matrix, scaled to a unit diagonal, exceed `-margin`."""
-    blocks = _scaled_blocks(matrix)
-    shifted = blocks + margin * jnp.eye(blocks.shape[1], dtype=blocks.dtype)[None]
-    is_positive = jnp.diagonal(shifted, axis1=1, axis2=2) > 0
-    return jnp.all(is_positive) & jnp.all(jnp.isfinite(jnp.linalg.cholesky(shifted)))
-
-
-def _is_definite(system: AbstractSystem, state: State, inertia: Symmetric) -> Array:
-    """Whether each velocity that the coordinates can have has a positive energy."""
+def _definiteness(system: AbstractSystem, inertia: Symmetric) -> dict[str, Flag]:
+    """Whether each velocity that the coordinates can have has a positive energy, and
+    whether no rigid body is flat."""
     if not isinstance(system, System):
-        return _is_positive_definite(inertia)
-    regular = system.kinematics.regular_inertia(state.q, inertia)
-    if regular is inertia:
-        return _is_positive_definite(inertia)
-    return _is_positive_definite(regular) & _is_positive_definite(inertia, 1e-9)
+        return dict(definite=is_positive_definite(inertia), regular=jnp.array(True))
+    # Moments of inertia are known to nine digits, or to the round-off of their dtype.
+    rounding = max(1e-9, 1e3 * float(jnp.finfo(inertia.dtype).eps))
+    kind = system.kinematics
+    return dict(
+        definite=kind.is_definite(inertia, rounding),
+        regular=kind.is_regular(inertia, rounding),
+    )
 
 
 def _is_quadratic(
@@ -118,7 +105,7 @@ def check_without_rotations(
         return
     if system.kinematics.with_rotations(state.q) is system.kinematics:
         return
-    is_regular = _is_regular(system, state, args)
+    is_regular = _facts(system, state, args)["regular"]
     if is_known(is_regular) and not is_regular:
         raise ValueError(
             f"`{scheme}` takes the axes of rigid bodies as coordinates, and a body of this "
@@ -126,11 +113,6 @@ def check_without_rotations(
             "or use a scheme that moves bodies by rotations: `EnergyPreserving`, "
             "`EnergyDecaying`, or `Composed` of the first."
         )
-
-
-@compiled
-def _is_regular(system: System, state: State, args: Args) -> Array:
-    return _is_positive_definite(system.inertia(state, args))
 
 
 def check_values(system: AbstractSystem, state: State, args: Args) -> None:

@@ -14,6 +14,7 @@ from ..._solvers import (
     constant_entries,
     independent_blocks,
     IndependentBlocks,
+    is_positive_definite,
     multiply_by_blocks,
 )
 from ..._types import Args, Coordinates, Increments, Velocities
@@ -32,6 +33,12 @@ class ConfigurationKinematics(AbstractFlatKinematics):
         return False
 
     def has_inertia(self, energy, inertia):
+        return jnp.array(True)
+
+    def is_definite(self, inertia, rounding):
+        return is_positive_definite(inertia)
+
+    def is_regular(self, inertia, rounding):
         return jnp.array(True)
 
     def describe(self, q, v):
@@ -64,6 +71,12 @@ class ConfigurationKinematics(AbstractFlatKinematics):
         rows = jax.jacfwd(relations)(q)
         unit = rows / jnp.linalg.norm(rows, axis=1, keepdims=True)
         return metric + jnp.trace(metric) / q.size * (unit.T @ unit)
+
+    def velocity_scale(self, inertia):
+        return jnp.sqrt(inertia.diagonal())
+
+    def step_scale(self, q, inertia, relations, args):
+        return jnp.sqrt(self.metric(q, inertia, relations, args).diagonal())
 
     def frames(self, q, jacobian, args):
         matrix = jnp.concatenate([self.matrix(q, args), jacobian(q)])

@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..._solvers import hessian
+from ..._solvers import hessian, is_positive_definite
 from ..._types import Coordinates, Increments, Velocities
 from .base import AbstractKinematics
 from .rigid_bodies import RigidBodies
@@ -66,6 +66,12 @@ class RigidKinematics(AbstractKinematics):
         a, b = rates(), rates()
         size = jnp.abs(a) @ jax.tree.map(jnp.abs, inertia) @ jnp.abs(a)
         return jnp.abs(energy(a) - energy(b)) <= 1e3 * jnp.finfo(dtype).eps * size
+
+    def is_definite(self, inertia, rounding):
+        return is_positive_definite(inertia)
+
+    def is_regular(self, inertia, rounding):
+        return jnp.array(True)
 
     def describe(self, q, v):
         others = self.bodies.other_q.size
@@ -108,6 +114,12 @@ class RigidKinematics(AbstractKinematics):
 
     def metric(self, q, inertia, relations, args):
         return inertia
+
+    def velocity_scale(self, inertia):
+        return jnp.sqrt(inertia.diagonal())
+
+    def step_scale(self, q, inertia, relations, args):
+        return self.velocity_scale(inertia)
 
     def coordinate_scale(self, step):
         # That of a director is the root of the polar moment, the sum of second moments.
