@@ -323,7 +323,7 @@ def test_a_decaying_scheme_takes_energy_from_a_free_body_but_no_momentum(moments
         drift(run.audit.energy[: n + 1])
         for run, n in zip(runs, (250, 500, 1000), strict=True)
     ]
-    assert lost[-1] <= 4e-7
+    assert lost[-1] <= 9e-7  # truncation
     assert slopes(lost) == pytest.approx([3, 3], abs=0.2)
     assert np.all(runs[0].audit.dissipated[1:] >= 0)
 
