@@ -41,7 +41,10 @@ BAD = {
         lambda: [Body("box", 1.0, [1.0, 1.0, 3.0], [0, 0, 0])],
         "No body has the `inertia` of 'box'",
     ),
-    "flat": (lambda: [Body("disc", 1.0, [1.0, 1.0, 2.0], [0, 0, 0])], "'disc' is flat"),
+    "rod": (
+        lambda: [Body("rod", 1.0, [0.0, 1.0, 1.0], [0, 0, 0])],
+        "'rod'.* must be positive.* thin rod needs a small moment",
+    ),
     "rotation": (
         lambda: [BOX(rotation=[1.0, 1.0, 0.0, 0.0])],
         "`rotation` of 'box' is no rotation",

@@ -252,6 +252,15 @@ def test_a_loop_is_closed_exactly():
     assert np.all(np.array(errors[0]) / errors[1] == pytest.approx(4, rel=0.1))
 
 
+def test_a_flat_body_of_a_file_is_a_rigid_body(tmp_path):
+    (tmp_path / "plate.xml").write_text(
+        '<mujoco><worldbody><body name="plate"><freejoint/><inertial pos="0 0 0" mass="2" '
+        'diaginertia="0.1 0.2 0.3"/></body></worldbody></mujoco>'
+    )
+    scene = ej.scenes.from_mjcf(tmp_path / "plate.xml")
+    assert scene.q.size == 12  # its mass centre and axes
+
+
 # URDF -----------------------------------------------------------------------------------
 
 

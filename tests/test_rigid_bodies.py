@@ -224,15 +224,17 @@ SCHEMES = {
     # Of order 4 here, with the directors as coordinates and constraints between them.
     "consistent": ej.EnergyConsistent(0.0),
 }
-MOMENTS, SPIN = np.array([0.6, 0.8, 0.3]), np.array([1.0, 2.0, 2.0])
+MOMENTS, SPIN = (0.6, 0.8, 0.3), np.array([1.0, 2.0, 2.0])
+# A plate, which has no inertia along its third axis.
+PLATE = (0.3, 0.5, 0.8)
 START = Rotation.from_rotvec([0.3, -0.5, 0.7]).as_matrix()
 TIME = 5.0
 
 
 @functools.cache
-def free_body(scheme, steps_to_time):
+def free_body(scheme, steps_to_time, moments=MOMENTS):
     body = ej.bodies.RigidBody(
-        "body", 2.0, MOMENTS, [0.1, 0.2, 0.3], START,
+        "body", 2.0, moments, [0.1, 0.2, 0.3], START,
         velocity=[0.5, -1.0, 0.25], angular_velocity=START @ SPIN,
     )  # fmt: skip
     system, start, args = ej.Scene([body]).build()
@@ -242,13 +244,14 @@ def free_body(scheme, steps_to_time):
 
 
 @functools.cache
-def attitude():
+def attitude(moments):
     """The rotation at `TIME` by Euler's equations and a quaternion."""
+    inertia = np.array(moments)
 
     def rates(t, y):
         (a, b, c, d), w = y[:4], y[4:]
         turn = np.array([[-b, -c, -d], [a, -d, c], [d, a, -b], [-c, b, a]]) @ w / 2
-        return np.append(turn, np.cross(MOMENTS * w, w) / MOMENTS)
+        return np.append(turn, np.cross(inertia * w, w) / inertia)
 
     first = np.append(np.roll(Rotation.from_matrix(START).as_quat(), 1), SPIN)
     found = solve_ivp(rates, (0, TIME), first, "DOP853", rtol=1e-13, atol=1e-13)
@@ -280,42 +283,49 @@ def largest_leak(run):
     return np.max(np.abs(np.diff(audit.energy) - supplied))
 
 
-def check_free_body(scheme, order):
+def check_free_body(scheme, order, moments=MOMENTS):
     errors = []
     for steps in (250, 500, 1000):
-        run = free_body(scheme, steps)
+        run = free_body(scheme, steps, moments)
         # Round-off, a random walk of a thousand steps.
-        for momentum in momenta(run, [2.0], [np.diag(MOMENTS)]):
+        for momentum in momenta(run, [2.0], [np.diag(moments)]):
             assert drift(momentum) <= 1e-13
         assert largest_leak(run) <= 1e-14
         assert np.max(np.abs(run.audit.constraint)) <= 1e-15
         rotation = run.ys.q[steps, 3:].reshape(3, 3).T
-        errors.append(np.max(np.abs(rotation - attitude())))
+        errors.append(np.max(np.abs(rotation - attitude(moments))))
     assert slopes(errors) == pytest.approx([order] * 2, abs=0.1)
     return errors
 
 
 @pytest.mark.parametrize(
-    ("scheme", "order", "error"),
+    ("scheme", "moments", "order", "error"),
     [
-        ("preserving", 2, 3e-4),
-        ("composed", 4, 1e-9),
+        ("preserving", MOMENTS, 2, 3e-4),
+        ("preserving", PLATE, 2, 4e-4),
+        ("composed", MOMENTS, 4, 1e-9),
+        ("composed", PLATE, 4, 2e-9),
     ],
 )
-def test_a_free_body_turns_as_eulers_equations(scheme, order, error):
-    assert check_free_body(scheme, order)[-1] <= error  # truncation
-    energy = free_body(scheme, 1000).audit.energy
+def test_a_free_body_turns_as_eulers_equations(scheme, moments, order, error):
+    assert check_free_body(scheme, order, moments)[-1] <= error  # truncation
+    energy = free_body(scheme, 1000, moments).audit.energy
     assert drift(energy) <= 2e-13  # round-off
 
 
 @pytest.mark.slow
-def test_a_decaying_scheme_takes_energy_from_a_free_body_but_no_momentum():
+@pytest.mark.parametrize("moments", [MOMENTS, PLATE])
+def test_a_decaying_scheme_takes_energy_from_a_free_body_but_no_momentum(moments):
     """The loss is of third order in the step, and vanishes only for a steady rotation."""
-    assert check_free_body("decaying", 2)[-1] <= 4e-4  # truncation
-    lost = [drift(free_body("decaying", n).audit.energy[: n + 1]) for n in (250, 500, 1000)]
-    assert lost[-1] <= 4e-7
+    assert check_free_body("decaying", 2, moments)[-1] <= 4e-4  # truncation
+    runs = [free_body("decaying", n, moments) for n in (250, 500, 1000)]
+    lost = [
+        drift(run.audit.energy[: n + 1])
+        for run, n in zip(runs, (250, 500, 1000), strict=True)
+    ]
+    assert lost[-1] <= 9e-7  # truncation
     assert slopes(lost) == pytest.approx([3, 3], abs=0.2)
-    assert np.all(free_body("decaying", 250).audit.dissipated[1:] >= 0)
+    assert np.all(runs[0].audit.dissipated[1:] >= 0)
 
 
 # Bodies with joints ----------------------------------------------------------------------
@@ -459,6 +469,100 @@ def test_a_hung_body_swings_as_one_whose_directors_are_coordinates():
         return np.concatenate([run.ys.q[steps], run.ys.v[steps]])
 
     check_against_directors(end, {"preserving": (2, 1.2e-2)}, 50)
+
+
+# The third moment is the sum of the others, as of a plate and of a thin rod.
+FLAT = {"plate": (0.05, 0.3, 0.35), "rod": (3e-4, 0.3, 0.3003)}
+
+
+def flat_system(name):
+    """The hung body with other moments, in the program of `hung_system`."""
+    system, _, args = hung_system()
+    return system, args.set("body", inertia=jnp.diag(jnp.array(FLAT[name])))
+
+
+def swing_about_the_pivot(moments, time):
+    """The first axis by Euler's equations about the pivot; the body starts in the axes of
+    space."""
+    centre = np.array([0.5, 0, 0])
+    inertia = np.diag(moments) + centre @ centre * np.eye(3) - np.outer(centre, centre)
+
+    def rates(_, y):
+        axes, w = y[:9].reshape(3, 3), y[9:]  # rotation matrix, angular velocity
+        torque = np.cross(centre, axes.T @ [0, 0, -9.81]) - np.cross(w, inertia @ w)
+        turn = np.cross(axes, w)  # R w^, row by row
+        return np.append(turn, np.linalg.solve(inertia, torque))
+
+    first = np.append(np.eye(3), np.asarray(SPEED))
+    found = solve_ivp(rates, (0, time), first, "DOP853", rtol=1e-12, atol=1e-13)
+    return found.y[:9, -1].reshape(3, 3)[:, 0], rates(0, first)[9:]
+
+
+@pytest.mark.parametrize("name", FLAT)
+def test_a_flat_hung_body_swings_as_eulers_equations(name):
+    system, args = flat_system(name)
+    begin, time, errors = turning(SPEED), 0.5, []
+    expected, _ = swing_about_the_pivot(FLAT[name], time)
+    for h in (0.01, 0.005):
+        run = on_host(
+            ej.simulate(system, ej.EnergyPreserving(), begin, args, h=h, num_steps=200)
+        )
+        assert drift(run.audit.energy) <= 1e-13  # round-off and solver
+        errors.append(np.max(np.abs(run.ys.q[round(time / h), 3:6] - expected)))
+    assert errors[0] <= 1e-3  # truncation
+    assert slopes(errors) == pytest.approx([2], abs=0.2)
+
+
+@pytest.mark.parametrize("name", FLAT)
+def test_a_start_of_a_flat_body_is_projected_and_accelerates(name):
+    system, args = flat_system(name)
+    _, spin_rate = swing_about_the_pivot(FLAT[name], 0.1)
+    moving = turning(SPEED)
+    # Moved off the pivot, with axes that are not orthonormal, and the rates to match.
+    off = jnp.zeros(12).at[jnp.array([0, 2, 4, 9])].set(1e-3)
+    near_by = ej.consistent_start(system, moving.q + off, moving.v + off, args)
+    assert np.max(np.abs(near_by.constraint_after)) <= 1e-15
+    assert np.max(np.abs(near_by.rate_after)) <= 1e-15
+    assert np.max(np.abs(near_by.state.q - moving.q)) <= 1e-2
+    found = ej.consistent_start(system, moving.q, moving.v, args)
+    np.testing.assert_array_equal(found.state.q, moving.q)
+    w, axis = np.asarray(SPEED), np.array([1.0, 0, 0])
+    expected = np.cross(spin_rate, axis) + np.cross(w, np.cross(w, axis))
+    # Round-off; that of the inertia about its axis is divided by that of the rod.
+    np.testing.assert_allclose(found.accelerations[3:6], expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_the_modes_of_a_hanging_plate_are_those_of_two_pendulums():
+    moments = np.array([0.2, 0.5, 0.7])
+    body = ej.bodies.RigidBody("plate", 2.0, moments, [0.0, 0.0, -0.5])
+    pivot = ej.joints.Spherical("pivot", "ground", "plate", [0, 0, 0], [0, 0, 0.5])
+    found = ej.modes(*ej.Scene([body, pivot], [0.0, 0.0, -9.81]).build()).frequencies
+    expected = np.sqrt(2.0 * 9.81 * 0.5 / (moments[:2] + 2.0 * 0.5**2))
+    np.testing.assert_allclose(found[1:], np.sort(expected), rtol=1e-12)  # round-off
+    # Round-off of a square: nothing turns the plate back about the vertical.
+    assert abs(found[0]) <= 1e-6
+
+
+def test_schemes_without_rotations_refuse_flat_bodies():
+    system, args = flat_system("plate")
+    for scheme in (ej.EnergyConsistent(0.0), ej.Composed(ej.Rattle(), 4)):
+        name = type(scheme.stage).__name__
+        with pytest.raises(ValueError, match=f"`{name}` takes the axes .* is flat"):
+            ej.simulate(system, scheme, turning(SPEED), args, h=0.01, num_steps=1)
+
+
+def test_one_flat_body_of_many_is_found_whatever_its_axes_are():
+    """Its least second moment is round-off, and not zero."""
+    to_axes = Rotation.from_rotvec([0.2, 0.5, 0.9]).as_matrix()
+    inertias = [np.diag(MOMENTS), to_axes @ np.diag(PLATE) @ to_axes.T, np.diag(MOMENTS)]
+    bodies = [
+        ej.bodies.RigidBody(f"body{k}", 2.0, (x + x.T) / 2, [k, 0.0, 0.0])
+        for k, x in enumerate(inertias)
+    ]
+    system, start, args = ej.Scene(bodies).build()
+    with pytest.raises(ValueError, match="`Rattle` takes the axes .* is flat"):
+        ej.simulate(system, ej.Rattle(), start, args, h=0.01, num_steps=1)
 
 
 # Places in scattered order: the vectors of the body, last director first, are interleaved.
@@ -695,6 +799,30 @@ def not_round(v, args):
 def test_kinetic_energies_that_no_rigid_body_has_are_errors(kinetic):
     message = r"not that of rigid bodies.* Is `x` another point .* Take the mass centre"
     with pytest.raises(ValueError, match=message):
+        begin(own(kinetic))
+
+
+@pytest.mark.parametrize(
+    ("moments", "is_right"),
+    [
+        ((1, 1, 2), True),
+        ((1, 1, 3), False),
+        ((0, 1, 1), False),
+        ((1e-12, 1, 1), False),
+    ],
+)
+def test_moments_that_no_rigid_body_has_are_errors(moments, is_right):
+    """Those of a plate are right; a negative second moment and an axis without are not."""
+
+    def kinetic(v, args):
+        rates, inertia = v[PLACES].reshape(4, 3), jnp.array(moments, float)
+        euler = jnp.sum(inertia) / 2 - inertia
+        return 0.5 * (rates[0] @ rates[0] + jnp.sum(euler[:, None] * rates[1:] ** 2))
+
+    if is_right:
+        begin(own(kinetic))
+        return
+    with pytest.raises(ValueError, match="not positive definite"):
         begin(own(kinetic))
 
 

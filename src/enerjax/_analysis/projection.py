@@ -154,7 +154,7 @@ def project_velocity(
     def correct(
         v: Velocities, conditions: Conditions, unit: Array, regularisation: Array | None
     ) -> Velocities:
-        inverse_metric = model.inverse_metric(State(q, v))
+        inverse_metric = model.inverse_regular_metric(State(q, v))
         rate = conditions(v)
 
         def change(mu: Array) -> Velocities:
@@ -164,7 +164,7 @@ def project_velocity(
         remaining = lambda mu: (rate - jax.jvp(conditions, (v,), (change(mu),))[1]) / unit
         return v - change(affine_root(remaining, rate, regularisation))
 
-    end, root = v, jnp.sqrt(model.inverse_metric(state).diagonal())
+    end, root = v, jnp.sqrt(model.inverse_regular_metric(state).diagonal())
     if known:
         # Known velocities may follow from the joints, so the rows may be dependent.
         indices = jnp.asarray(known, int)

@@ -219,6 +219,14 @@ class AbstractModel(eqx.Module):
         """
 
     @abc.abstractmethod
+    def inverse_regular_metric(self, state: State) -> Symmetric:
+        """The inverse of a regular metric of `State.v`.
+
+        It is the metric for those `State.v` that the constraints between the axes of rigid
+        bodies admit. The metric itself is singular for a flat body.
+        """
+
+    @abc.abstractmethod
     def stiffness(
         self, state: State, multipliers: Multipliers
     ) -> tuple[Float[Array, "nq nq"] | Assembled, Symmetric]:
@@ -415,7 +423,7 @@ class AbstractModel(eqx.Module):
         multipliers minimise.
         """
         q = state.q
-        step = jnp.sqrt(self.metric(state).diagonal())
+        step = self.step_scale(state)
         coordinate = self.coordinate_scale(step)
         rows = lambda q: self.constraint(q, state.t)
         pattern = RowPattern(rows, q)
@@ -430,6 +438,10 @@ class AbstractModel(eqx.Module):
         constraint = jnp.where(constraint > 0, constraint, 1.0)
         scales = Scales(coordinate, step, constraint, size)
         return scales if self.system.redundant else jax.lax.stop_gradient(scales)
+
+    @abc.abstractmethod
+    def step_scale(self, state: State) -> Increments:
+        """The scales of the rates of an increment."""
 
     @abc.abstractmethod
     def coordinate_scale(self, step: Increments) -> Coordinates:

@@ -188,8 +188,14 @@ class CanonicalModel(AbstractModel):
     def metric(self, state: State) -> Float[Array, "nq nq"]:
         return as_dense(self.system.inertia(self.to_user(state), self.args))
 
+    def step_scale(self, state: State) -> Coordinates:
+        return jnp.sqrt(self.metric(state).diagonal())
+
     def inverse_metric(self, state: State) -> Float[Array, "nv nv"]:
         return self.metric(state)
+
+    def inverse_regular_metric(self, state: State) -> Float[Array, "nv nv"]:
+        return self.inverse_metric(state)
 
     def stiffness(
         self, state: State, multipliers: Multipliers

@@ -342,6 +342,14 @@ class SeparableModel(AbstractModel):
     def inverse_metric(self, state: State) -> Symmetric:
         return self.inverse_inertia
 
+    def inverse_regular_metric(self, state: State) -> Symmetric:
+        regular = self.kinematics.regular_inertia(state.q, self.inertia)
+        return self.inverse_inertia if regular is self.inertia else inverse_of(regular)
+
+    def step_scale(self, state: State) -> Increments:
+        kind, relations = self.kinematics, self.coordinate
+        return kind.step_scale(state.q, self.inertia, relations, self.args)
+
     def coordinate_scale(self, step: Increments) -> Coordinates:
         return self.kinematics.coordinate_scale(step)
 
@@ -434,7 +442,7 @@ class SeparableModel(AbstractModel):
         if gyroscopic is not None:
             slope = slope + gyroscopic
         free_rate = self._free_joint_acceleration(state, qdot)
-        unit = 1 / jnp.sqrt(self.inertia.diagonal())
+        unit = 1 / self.kinematics.velocity_scale(self.inertia)
 
         def conditions(x: Array) -> Array:
             acceleration, multipliers = unit * x[: v.size], x[v.size :] / scales.constraint

@@ -18,11 +18,12 @@ from .._system import (
     check_not_varying,
     check_number,
     check_system,
+    check_without_rotations,
     describe,
     State,
 )
 from .._types import Args, Real, Scalar
-from ..schemes import AbstractScheme
+from ..schemes import AbstractScheme, AbstractSchemeWithRotations
 from .discrete_gradient_check import check_derivatives
 
 
@@ -69,6 +70,10 @@ def prepare(
         raise ValueError(
             f"`h` must be a scalar, got shape {h.shape}. To sweep it use `jax.vmap`."
         )
+    if is_known((system, start, args)) and not isinstance(
+        scheme.stage, AbstractSchemeWithRotations
+    ):
+        check_without_rotations(system, start, args, type(scheme.stage).__name__)
     if is_known((scheme, system, start, args)):
         check_derivatives(scheme, system, start, args)
     return start, args, h, jnp.asarray(t, h.dtype)

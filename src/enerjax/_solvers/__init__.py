@@ -8,7 +8,9 @@ from .linear.block_diagonal import (
     hessian as hessian,
     in_blocks as in_blocks,
     inverse_of as inverse_of,
+    is_positive_definite as is_positive_definite,
     padded as padded,
+    scaled_blocks as scaled_blocks,
     Symmetric as Symmetric,
 )
 from .linear.cholesky_eigh import cholesky as cholesky, eigh as eigh

@@ -15,7 +15,10 @@ from .checks.system import (
     check_number as check_number,
     check_system as check_system,
 )
-from .checks.values import direction_without_symmetry as direction_without_symmetry
+from .checks.values import (
+    check_without_rotations as check_without_rotations,
+    direction_without_symmetry as direction_without_symmetry,
+)
 from .elements import Elements as Elements
 from .kinematics import (
     AbstractKinematics as AbstractKinematics,

@@ -74,7 +74,8 @@ class System(AbstractSystem):
       `EnergyDecaying` and their compositions move these bodies by rotations, with six
       unknowns each, and conserve angular momentum to round-off where rotations change
       neither the potential nor the constraints. Other schemes impose six constraints on
-      each body, whose multipliers follow those of `constraint`.
+      each body, whose multipliers follow those of `constraint`; they refuse flat bodies,
+      for which `E` is singular.
     - `names`: names of coordinates, velocities and constraints for tables; see `Names`.
 
     `args` is any pytree; the functions must be smooth and written with `jax.numpy`.

@@ -9,24 +9,18 @@ from ._arguments import module_of, number, positive
 from ._frames import Numbers
 
 
-def mass_and_inertia(name: str, mass: Any, inertia: Any, *, may_be_flat: bool) -> Numbers:
+def mass_and_inertia(name: str, mass: Any, inertia: Any) -> Numbers:
     """The checked mass and inertia of a body, the latter as a matrix `(3, 3)`."""
     mass = positive(f"'{name}'", "`mass`", mass)
     matrix = number(f"'{name}'", "`inertia`", inertia, (3,), (3, 3))
     if matrix.ndim == 1:
         matrix = module_of(matrix).diag(matrix)
     if is_known(matrix):
-        _check_inertia(name, matrix, may_be_flat)
+        _check_inertia(name, matrix)
     return dict(mass=mass, inertia=matrix)
 
 
-def is_flat(matrix: np.ndarray) -> bool:
-    """Whether a body with this inertia has no mass along one of its axes."""
-    moments = np.linalg.eigvalsh(matrix)
-    return bool(moments.sum() / 2 - moments[-1] <= 1e-9 * moments[-1])
-
-
-def _check_inertia(name: str, matrix: np.ndarray, may_be_flat: bool) -> None:
+def _check_inertia(name: str, matrix: np.ndarray) -> None:
     size = np.max(np.abs(matrix))
     if np.max(np.abs(matrix - matrix.T)) > 1e-9 * size:
         raise ValueError(f"`inertia` of '{name}' is not symmetric: {matrix.tolist()}.")
@@ -35,13 +29,8 @@ def _check_inertia(name: str, matrix: np.ndarray, may_be_flat: bool) -> None:
     if smallest <= 1e-9 * size or thinnest < -1e-9 * size:
         raise ValueError(
             f"No body has the `inertia` of '{name}', principal moments {moments.tolist()}: "
-            "all must be positive, and none larger than the sum of the other two."
-        )
-    if is_flat(matrix) and not may_be_flat:
-        raise ValueError(
-            f"'{name}' is flat: of its principal moments {moments.tolist()} the largest is "
-            "the sum of the others. A `RigidBody` needs mass along each of its axes: give "
-            "it a thickness, or use a `QuaternionBody`."
+            "all must be positive, and none larger than the sum of the other two. (A thin "
+            "rod needs a small moment about its own axis.)"
         )
 
 

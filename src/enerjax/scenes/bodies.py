@@ -177,9 +177,12 @@ class RigidBody(AbstractBody):
     six unknowns in a step, and `EnergyPreserving` conserves momenta to round-off. Other
     schemes impose six constraints between its axes; see `rigid_bodies` of `System`.
 
-    **Raises:** `ValueError` for moments of inertia that no body has, and for those of a
-    flat body or a thin rod, which have no mass along one axis. Give such a body a
-    thickness, or use `QuaternionBody`.
+    The body can be flat, so that one of its principal moments is the sum of the other two:
+    a plate, or a rod whose inertia about its own axis is small. Schemes that impose
+    constraints between the axes refuse flat bodies.
+
+    **Raises:** `ValueError` for moments of inertia that no body has, and for a moment of
+    zero.
     """
 
     def __init__(
@@ -195,7 +198,7 @@ class RigidBody(AbstractBody):
         shape: Shape | None = None,
     ):
         self.name, self.shapes = name, as_shapes(f"'{name}'", shape)
-        self.numbers = mass_and_inertia(name, mass, inertia, may_be_flat=False)
+        self.numbers = mass_and_inertia(name, mass, inertia)
         axes = rotation_matrix(name, rotation).T
         self.q = joined(number(f"'{name}'", "`position`", position, (3,)), axes)
         v, flags = velocities(f"'{name}'", (velocity, (3,)), (angular_velocity, (3,)))
@@ -210,11 +213,10 @@ class RigidBody(AbstractBody):
 class QuaternionBody(AbstractBody):
     """A rigid body in space, with Euler parameters as coordinates.
 
-    It can be flat, which a `RigidBody` cannot; the arguments are the same. It has seven
-    coordinates, the mass centre and a unit quaternion (scalar first); its velocities are
-    that of the mass centre and the angular velocity in body axes. Angular momentum is
-    conserved to second order only, and `EnergyConsistent`
-    cannot be used.
+    The arguments are those of `RigidBody`. It has seven coordinates, the mass centre and a
+    unit quaternion (scalar first); its velocities are that of the mass centre and the
+    angular velocity in body axes. Angular momentum is conserved to second order only, and
+    `EnergyConsistent` cannot be used.
     """
 
     def __init__(
@@ -230,7 +232,7 @@ class QuaternionBody(AbstractBody):
         shape: Shape | None = None,
     ):
         self.name, self.shapes = name, as_shapes(f"'{name}'", shape)
-        self.numbers = mass_and_inertia(name, mass, inertia, may_be_flat=True)
+        self.numbers = mass_and_inertia(name, mass, inertia)
         matrix, part = rotation_matrix(name, rotation), f"'{name}'"
         position = number(part, "`position`", position, (3,))
         self.q = joined(position, quaternion_of(matrix))

@@ -11,6 +11,7 @@ import scipy
 from jaxtyping import Array, Float
 
 from ..._programs import Indices, is_known, jacobian_pattern, summed
+from ..._types import Flag
 
 
 # The largest block size for which a matrix is stored in blocks, and the size up to which a
@@ -115,6 +116,30 @@ def as_dense(matrix: Symmetric) -> Float[Array, "n n"]:
 def blocks_of(matrix: Symmetric) -> Float[Array, "blocks size size"]:
     """The blocks along the diagonal; a plain array is one block."""
     return matrix.blocks if isinstance(matrix, BlockDiagonal) else matrix[None]
+
+
+def scaled_blocks(matrix: Symmetric) -> Float[Array, "blocks size size"]:
+    """The blocks of a matrix, with ones on the diagonal where that is positive."""
+    blocks = blocks_of(matrix)
+    masses = jnp.diagonal(blocks, axis1=1, axis2=2)
+    largest = jnp.max(jnp.abs(masses))
+    root = jnp.sqrt(jnp.where(masses > 0, masses, jnp.where(largest > 0, largest, 1)))
+    return blocks / (root[:, :, None] * root[:, None, :])
+
+
+def is_positive_definite(
+    matrix: Symmetric, margins: Float[np.ndarray, " n"] | None = None
+) -> Flag:
+    """Whether a matrix is positive definite, after it is scaled to ones on the diagonal and
+    `margins` are added there."""
+    blocks = scaled_blocks(matrix)
+    if margins is not None:
+        is_array = not isinstance(matrix, BlockDiagonal)
+        rows = np.arange(margins.size)[None] if is_array else matrix.places.rows
+        added = np.append(margins, 0)[rows][:, :, None] * np.eye(rows.shape[1])
+        blocks = blocks + jnp.asarray(added, matrix.dtype)
+    is_positive = jnp.diagonal(blocks, axis1=1, axis2=2) > 0
+    return jnp.all(is_positive) & jnp.all(jnp.isfinite(jnp.linalg.cholesky(blocks)))
 
 
 def hessian(

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..._programs import compiled, is_known
-from ..._solvers import blocks_of, Symmetric
-from ..._types import Args
+from ..._solvers import is_positive_definite, scaled_blocks, Symmetric
+from ..._types import Args, Flag
 from ..base import AbstractSystem, State
 from ..canonical import HamiltonianSystem, LagrangianSystem
 from ..separable import System
@@ -22,10 +22,7 @@ def direction_without_symmetry(x: Float[Array, " n"]) -> Float[Array, " n"]:
 @compiled
 def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]:
     inertia = system.inertia(state, args)
-    blocks, eps = blocks_of(inertia), 1e3 * jnp.finfo(inertia.dtype).eps
-    masses = jnp.diagonal(blocks, axis1=1, axis2=2)
-    root = jnp.sqrt(jnp.where(masses > 0, masses, 1))
-    scaled = blocks / (root[:, :, None] * root[:, None, :])
+    blocks, eps = scaled_blocks(inertia), 1e3 * jnp.finfo(inertia.dtype).eps
     finite = lambda tree: jnp.all(
         jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(tree)], bool)
     )
@@ -54,9 +51,23 @@ def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]
         depends=jnp.array(system.redundant) | jnp.all(slopes != 0),
         inertia=finite(inertia),
         quadratic=_is_quadratic(system, state, inertia, args),
-        symmetric=jnp.all(jnp.abs(scaled - jnp.swapaxes(scaled, 1, 2)) <= eps),
-        definite=jnp.all(masses > 0) & finite(jnp.linalg.cholesky(scaled)),
+        symmetric=jnp.all(jnp.abs(blocks - jnp.swapaxes(blocks, 1, 2)) <= eps),
+        **_definiteness(system, inertia),
         rigid=_is_rigid(system, state, inertia, args),
+    )
+
+
+def _definiteness(system: AbstractSystem, inertia: Symmetric) -> dict[str, Flag]:
+    """Whether each velocity that the coordinates can have has a positive energy, and
+    whether no rigid body is flat."""
+    if not isinstance(system, System):
+        return dict(definite=is_positive_definite(inertia), regular=jnp.array(True))
+    # Moments of inertia are known to nine digits, or to the round-off of their dtype.
+    rounding = max(1e-9, 1e3 * float(jnp.finfo(inertia.dtype).eps))
+    kind = system.kinematics
+    return dict(
+        definite=kind.is_definite(inertia, rounding),
+        regular=kind.is_regular(inertia, rounding),
     )
 
 
@@ -84,6 +95,24 @@ def _is_rigid(
         return jnp.array(True)
     energy = lambda v: system.kinetic_energy(State(state.q, v), args)
     return system.kinematics.has_inertia(energy, inertia)
+
+
+def check_without_rotations(
+    system: AbstractSystem, state: State, args: Args, scheme: str
+) -> None:
+    """Raises an error for a flat body in a scheme that moves no bodies by rotations."""
+    if not isinstance(system, System):
+        return
+    if system.kinematics.with_rotations(state.q) is system.kinematics:
+        return
+    is_regular = _facts(system, state, args)["regular"]
+    if is_known(is_regular) and not is_regular:
+        raise ValueError(
+            f"`{scheme}` takes the axes of rigid bodies as coordinates, and a body of this "
+            "system is flat: it has no inertia along one of its axes. Give it a thickness, "
+            "or use a scheme that moves bodies by rotations: `EnergyPreserving`, "
+            "`EnergyDecaying`, or `Composed` of the first."
+        )
 
 
 def check_values(system: AbstractSystem, state: State, args: Args) -> None:

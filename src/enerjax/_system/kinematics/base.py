@@ -86,6 +86,17 @@ class AbstractKinematics(eqx.Module):
         `inertia` of the user's velocities."""
 
     @abc.abstractmethod
+    def is_definite(self, inertia: Symmetric, rounding: float) -> Flag:
+        """Whether each velocity that the coordinates can have has a positive energy.
+
+        `rounding` is the relative round-off of a body's moments of inertia.
+        """
+
+    @abc.abstractmethod
+    def is_regular(self, inertia: Symmetric, rounding: float) -> Flag:
+        """Whether bodies have inertia along all of their axes, so that none is flat."""
+
+    @abc.abstractmethod
     def describe(self, q: Coordinates, v: Velocities) -> str:
         """How the coordinates move, in words."""
 
@@ -124,17 +135,29 @@ class AbstractKinematics(eqx.Module):
         """`M`, which is constant. `of_user` returns that of the user's velocities."""
 
     @abc.abstractmethod
+    def regular_inertia(self, q: Coordinates, inertia: Symmetric) -> Symmetric:
+        """A regular matrix with the energy of `inertia` for velocities that satisfy
+        `constraint`, and with more for others."""
+
+    @abc.abstractmethod
     def metric(
         self, q: Coordinates, inertia: Symmetric, relations: Relations, args: Args
     ) -> Symmetric:
         """The inertia matrix of the increments, regular also where they are redundant."""
 
     @abc.abstractmethod
-    def coordinate_scale(self, step: Increments) -> Coordinates:
-        """The scales of the coordinates, given those of the increments.
+    def velocity_scale(self, inertia: Symmetric) -> Velocities:
+        """The scales of the velocities. Scales are the roots of inertias."""
 
-        Scales are the roots of inertias.
-        """
+    @abc.abstractmethod
+    def step_scale(
+        self, q: Coordinates, inertia: Symmetric, relations: Relations, args: Args
+    ) -> Increments:
+        """The scales of the increments."""
+
+    @abc.abstractmethod
+    def coordinate_scale(self, step: Increments) -> Coordinates:
+        """The scales of the coordinates, given those of the increments."""
 
     @abc.abstractmethod
     def frames(

@@ -14,6 +14,7 @@ from ..._solvers import (
     constant_entries,
     independent_blocks,
     IndependentBlocks,
+    is_positive_definite,
     multiply_by_blocks,
 )
 from ..._types import Args, Coordinates, Increments, Velocities
@@ -34,6 +35,12 @@ class ConfigurationKinematics(AbstractFlatKinematics):
     def has_inertia(self, energy, inertia):
         return jnp.array(True)
 
+    def is_definite(self, inertia, rounding):
+        return is_positive_definite(inertia)
+
+    def is_regular(self, inertia, rounding):
+        return jnp.array(True)
+
     def describe(self, q, v):
         return f"{q.size} coordinates with {v.size} velocities v = L(q) qdot"
 
@@ -52,6 +59,9 @@ class ConfigurationKinematics(AbstractFlatKinematics):
     def constraint(self, q):
         return q[:0]
 
+    def regular_inertia(self, q, inertia):
+        return inertia
+
     def metric(self, q, inertia, relations, args):
         # It is `L^T M L + m sum_i b_i b_i^T`, with the normalised gradients `b_i` of the
         # coordinate constraints. `m` is the mean inertia of a coordinate, so the result
@@ -61,6 +71,12 @@ class ConfigurationKinematics(AbstractFlatKinematics):
         rows = jax.jacfwd(relations)(q)
         unit = rows / jnp.linalg.norm(rows, axis=1, keepdims=True)
         return metric + jnp.trace(metric) / q.size * (unit.T @ unit)
+
+    def velocity_scale(self, inertia):
+        return jnp.sqrt(inertia.diagonal())
+
+    def step_scale(self, q, inertia, relations, args):
+        return jnp.sqrt(self.metric(q, inertia, relations, args).diagonal())
 
     def frames(self, q, jacobian, args):
         matrix = jnp.concatenate([self.matrix(q, args), jacobian(q)])

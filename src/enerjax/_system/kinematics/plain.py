@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 
+from ..._solvers import is_positive_definite
 from .base import AbstractFlatKinematics
 
 
@@ -19,7 +20,10 @@ class AbstractPlainKinematics(AbstractFlatKinematics):
         return self
 
     def metric(self, q, inertia, relations, args):
-        return inertia
+        return self.regular_inertia(q, inertia)
+
+    def step_scale(self, q, inertia, relations, args):
+        return self.velocity_scale(inertia)
 
     def frames(self, q, jacobian, args):
         return None
@@ -52,8 +56,20 @@ class IdentityKinematics(AbstractPlainKinematics):
     def has_inertia(self, energy, inertia):
         return jnp.array(True)
 
+    def is_definite(self, inertia, rounding):
+        return is_positive_definite(inertia)
+
+    def is_regular(self, inertia, rounding):
+        return jnp.array(True)
+
     def with_rotations(self, q):
         return self
 
     def constraint(self, q):
         return q[:0]
+
+    def regular_inertia(self, q, inertia):
+        return inertia
+
+    def velocity_scale(self, inertia):
+        return jnp.sqrt(inertia.diagonal())

@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..._solvers import hessian
+from ..._solvers import hessian, is_positive_definite
 from ..._types import Coordinates, Increments, Velocities
 from .base import AbstractKinematics
 from .rigid_bodies import RigidBodies
@@ -67,6 +67,12 @@ class RigidKinematics(AbstractKinematics):
         size = jnp.abs(a) @ jax.tree.map(jnp.abs, inertia) @ jnp.abs(a)
         return jnp.abs(energy(a) - energy(b)) <= 1e3 * jnp.finfo(dtype).eps * size
 
+    def is_definite(self, inertia, rounding):
+        return is_positive_definite(inertia)
+
+    def is_regular(self, inertia, rounding):
+        return jnp.array(True)
+
     def describe(self, q, v):
         others = self.bodies.other_q.size
         return (
@@ -103,8 +109,17 @@ class RigidKinematics(AbstractKinematics):
         at_rest = jnp.zeros((bodies.num_velocities,), dtype)
         return hessian(lambda v: energy(self.user_velocity(q, v)), at_rest, together)
 
+    def regular_inertia(self, q, inertia):
+        return inertia
+
     def metric(self, q, inertia, relations, args):
         return inertia
+
+    def velocity_scale(self, inertia):
+        return jnp.sqrt(inertia.diagonal())
+
+    def step_scale(self, q, inertia, relations, args):
+        return self.velocity_scale(inertia)
 
     def coordinate_scale(self, step):
         # That of a director is the root of the polar moment, the sum of second moments.

@@ -4,8 +4,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from .._rotations import is_flat
-from ..bodies import QuaternionBody, RigidBody
+from ..bodies import RigidBody
 from ..scene import Scene
 from . import mujoco
 from .coefficients import gravity_of
@@ -148,15 +147,14 @@ def _start_of(model: Any, told: str, keyframe: str | int | None) -> Any:
     return data
 
 
-def _body(tree: Tree, root: int) -> RigidBody | QuaternionBody:
+def _body(tree: Tree, root: int) -> RigidBody:
     rotation, origin = tree.pose(root)
     weight, name = tree.weights[root], tree.names[root]
     # Without velocities at the start they all follow from the joints: they are zero.
     velocity = angular = None
     if tree.data.qvel.any():
         velocity, angular = tree.velocity(root)
-    kind = QuaternionBody if is_flat(weight.inertia) else RigidBody
-    return kind(
+    return RigidBody(
         name,
         weight.mass,
         weight.inertia,
