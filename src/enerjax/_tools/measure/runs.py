@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import statistics
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -159,7 +158,7 @@ def _run(
     return Run(
         *map(_largest, errors),
         evaluations=float(np.sum(np.asarray(solution.stats.newton_iterations))),
-        seconds=statistics.median(seconds) if seconds else math.nan,
+        seconds=float(np.median(seconds)) if seconds else math.nan,
     )
 
 
