@@ -33,7 +33,7 @@ _FIRST_ATTEMPTS = 64
 _PART_FOR_WRITING = 0.05
 
 
-class _Sofar(NamedTuple):
+class _RunSoFar(NamedTuple):
     """A run so far: its start, tables of closed groups, and what the next step needs."""
 
     begin: Begin
@@ -60,9 +60,9 @@ class _LongRun:
         program = piece.program(task, carry, np.array(0))
         self._fingerprint = _fingerprint(task, digest(program))
         carry, table = self._made(carry, 0)
-        self.first = _Sofar(begin, (table,), carry)
+        self.first = _RunSoFar(begin, (table,), carry)
 
-    def continued(self, solution: Solution, name: str) -> _Sofar:
+    def continued(self, solution: Solution, name: str) -> _RunSoFar:
         """The run so far, from the solution that `name` stands for."""
         known = solution.continuation
         if known is None:
@@ -81,7 +81,7 @@ class _LongRun:
             )
         structure = jax.tree.structure((self.first.begin, *self.first[1], self.first.carry))
         begin, table, carry = jax.tree.unflatten(structure, map(np.asarray, known.numbers))
-        sofar = _Sofar(begin, (table,), carry)
+        sofar = _RunSoFar(begin, (table,), carry)
         if carry.progress.place > self._task.plan.last:
             raise ValueError(
                 f"{name} is longer than this run: it has made {_completed(sofar)} steps. "
@@ -89,35 +89,35 @@ class _LongRun:
             )
         return sofar
 
-    def is_finished(self, sofar: _Sofar) -> bool:
+    def is_finished(self, sofar: _RunSoFar) -> bool:
         progress = sofar.carry.progress
         failed = bool(progress.result != RESULTS.successful)
         arrived = bool(progress.place >= self._task.plan.last)
         return failed or arrived or self.attempts(sofar) >= self._max_attempts
 
-    def attempts(self, sofar: _Sofar) -> int:
+    def attempts(self, sofar: _RunSoFar) -> int:
         """The number of attempted steps."""
         rejected = self._task.plan.num_rejected(sofar.carry.progress.memory)
         return _completed(sofar) + int(0 if rejected is None else rejected)
 
-    def go_on(self, sofar: _Sofar, attempts: int) -> _Sofar:
+    def go_on(self, sofar: _RunSoFar, attempts: int) -> _RunSoFar:
         """The run after so many more attempts, or fewer."""
         attempts = min(attempts, self._max_attempts - self.attempts(sofar))
         carry, table = self._made(sofar.carry, attempts)
-        return _Sofar(sofar.begin, (*sofar.closed, table), carry)
+        return _RunSoFar(sofar.begin, (*sofar.closed, table), carry)
 
     def _made(self, carry: Carry, attempts: int) -> tuple[Carry, Record]:
         carry, table, count = jax.device_get(piece(self._task, carry, np.array(attempts)))
         # Copies: on CPUs a view would keep the memory of the whole table.
         return carry, jax.tree.map(lambda x: np.array(x[:count]), table)
 
-    def times(self, sofar: _Sofar) -> tuple[float, float]:
+    def times(self, sofar: _RunSoFar) -> tuple[float, float]:
         """The time since the start that is reached, and that of the end."""
         plan = self._task.plan
         unit = float(plan.unit)
         return unit * float(sofar.carry.progress.place), unit * float(plan.last)
 
-    def solution(self, sofar: _Sofar) -> tuple[Solution, Scalar]:
+    def solution(self, sofar: _RunSoFar) -> tuple[Solution, Scalar]:
         """The solution so far, and the time that is reached; later rows are NaN."""
         table = jax.tree.map(lambda *x: np.concatenate(x), *sofar.closed)
         count = table.place.size
@@ -150,7 +150,7 @@ def _check_alone(is_alone: bool) -> None:
         )
 
 
-def _completed(sofar: _Sofar) -> int:
+def _completed(sofar: _RunSoFar) -> int:
     return int(sofar.carry.progress.completed)
 
 
@@ -172,8 +172,8 @@ def _fingerprint(task: Task, program: str) -> tuple[tuple[str, str], ...]:
     return tuple(words)
 
 
-class Wishes(NamedTuple):
-    """The checked arguments of `simulate` that make a run one in pieces."""
+class LongRunOptions(NamedTuple):
+    """The checked arguments of `simulate` by which a run is made piece by piece."""
 
     progress: Progress
     checkpoint: "_Checkpoint | None"
@@ -199,9 +199,9 @@ class _Checkpoint:
         self._next = now + max(self._pause, (now - begin) / _PART_FOR_WRITING)
 
 
-def checked_wishes(
+def checked_options(
     progress: Any, checkpoint: Any, checkpoint_seconds: Any, resume: Any
-) -> Wishes | None:
+) -> LongRunOptions | None:
     """The checked arguments, or `None` for a run in one piece."""
     check_progress(progress)
     if not (resume is None or isinstance(resume, Solution)):
@@ -225,19 +225,19 @@ def checked_wishes(
         file = _Checkpoint(path, float(seconds))
     if progress is False and file is None and resume is None:
         return None
-    return Wishes(progress, file, resume)
+    return LongRunOptions(progress, file, resume)
 
 
-def run_long(task: Task, num_rows: int, wishes: Wishes) -> tuple[Solution, Scalar]:
-    """The solution, of an interrupted run that so far, and the time that is reached."""
-    run, file = _LongRun(task, num_rows), wishes.checkpoint
+def run_long(task: Task, num_rows: int, options: LongRunOptions) -> tuple[Solution, Scalar]:
+    """The solution and the time that it has reached; partial if the run was interrupted."""
+    run, file = _LongRun(task, num_rows), options.checkpoint
     sofar, in_file = run.first, None
     if file is not None and file.path.exists():
         # The file may be further than the solution that this run was continued from.
         sofar = in_file = run.continued(load(file.path), f"The file {file.path}")
-    elif wishes.resume is not None:
-        sofar = run.continued(wishes.resume, "`resume`")
-    report, attempts = _reporter(run, wishes.progress), _FIRST_ATTEMPTS
+    elif options.resume is not None:
+        sofar = run.continued(options.resume, "`resume`")
+    report, attempts = _reporter(run, options.progress), _FIRST_ATTEMPTS
     try:
         while not run.is_finished(sofar):
             if file is not None and file.is_due and sofar is not in_file:
@@ -258,7 +258,7 @@ def run_long(task: Task, num_rows: int, wishes: Wishes) -> tuple[Solution, Scala
     return solution, reached
 
 
-def _reporter(run: _LongRun, progress: Progress) -> Callable[[_Sofar], None]:
+def _reporter(run: _LongRun, progress: Progress) -> Callable[[_RunSoFar], None]:
     if callable(progress):
         return lambda sofar: progress(*run.times(sofar))
     return _Bar(run) if progress else lambda sofar: None
@@ -272,14 +272,14 @@ class _Bar:
         self._line = Line(pause=10.0)
         self._begin: tuple[float, float] | None = None
 
-    def __call__(self, sofar: _Sofar) -> None:
+    def __call__(self, sofar: _RunSoFar) -> None:
         self._show(sofar, self._run.is_finished(sofar))
 
-    def end(self, sofar: _Sofar) -> None:
+    def end(self, sofar: _RunSoFar) -> None:
         """Ends the line of an interrupted run."""
         self._show(sofar, is_last=True)
 
-    def _show(self, sofar: _Sofar, is_last: bool) -> None:
+    def _show(self, sofar: _RunSoFar, is_last: bool) -> None:
         (done, whole), now = self._run.times(sofar), time.monotonic()
         if self._begin is None:
             # Speed is measured from here: a run that is continued did not start now.

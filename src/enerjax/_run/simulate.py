@@ -12,7 +12,7 @@ from .._types import Args, Real, Scalar
 from ..schemes import AbstractScheme
 from .failure import explained_memory_error, raise_failure
 from .inputs import check_halvings, prepare
-from .long_run import checked_wishes, run_long
+from .long_run import checked_options, run_long
 from .loop import run_loop
 from .saving import RecordedRun, SaveAt, saving_of
 from .solution import first_rows, Solution
@@ -110,11 +110,11 @@ def simulate(
     if not isinstance(saveat, SaveAt):
         raise TypeError(f"`saveat` must be a `SaveAt`, got {saveat!r}.")
     check_halvings(max_halvings)
-    wishes = checked_wishes(progress, checkpoint, checkpoint_seconds, resume)
+    options = checked_options(progress, checkpoint, checkpoint_seconds, resume)
     start, args, step, begin = prepare(system, scheme, start, args, h, t0, root_finder)
     end = find_end(num_steps, t1, max_steps, controller, h, t0, step.dtype)
     plan = controller.plan(scheme, step, begin, end)
-    longest = plan.max_attempts if wishes is None else sys.maxsize
+    longest = plan.max_attempts if options is None else sys.maxsize
     task = Task(
         system=system,
         scheme=scheme,
@@ -128,10 +128,10 @@ def simulate(
     )
     num_rows = task.saving.num_rows(plan)
     with explained_memory_error(plan.max_attempts):
-        if wishes is None:
+        if options is None:
             solution, reached = _whole(task, num_rows)
         else:
-            solution, reached = run_long(task, num_rows, wishes)
+            solution, reached = run_long(task, num_rows, options)
     if not throw:
         return solution
     equal = plan.unit if isinstance(controller, EqualSteps) else None
