@@ -69,7 +69,6 @@ def differences(fn, x, step=1e-5):
     return [(fn(x + row) - fn(x - row)) / (2 * step) for row in rows]
 
 
-@pytest.mark.slow
 def test_gradients_of_a_bead_on_a_parabola():
     """Its inertia varies; by the curvature, and by the alpha of the scheme."""
     system = ej.System.from_lagrangian(

@@ -211,6 +211,9 @@ class _EqualPlan(AbstractPlan):
         return self.t0, self.unit
 
     def rounded_up(self) -> "_EqualPlan":
+        if is_known(self.last) and self.last > self.max_attempts:
+            # The bound of the user ends this run.
+            return self
         room = 1 << (self.max_attempts - 1).bit_length()
         return dataclasses.replace(self, max_attempts=room, is_counted=False)
 
