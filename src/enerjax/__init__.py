@@ -28,6 +28,8 @@ from ._run import (
     AbstractController as AbstractController,
     Audit as Audit,
     EqualSteps as EqualSteps,
+    Event as Event,
+    Impact as Impact,
     load as load,
     save as save,
     SaveAt as SaveAt,
