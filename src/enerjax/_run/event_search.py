@@ -60,7 +60,7 @@ class Watch(eqx.Module):
 
 
 class Search(eqx.Module):
-    """An interval of lengths of a step: without a zero at its start, and with one at its end.
+    """An interval of lengths of a step: steps of the upper length pass a zero.
 
     - `active`: whether there is a search.
     - `lower`, `upper`: the ends of the interval.
@@ -240,7 +240,9 @@ class Watcher(eqx.Module):
 
     def _armed(self, watch: Watch) -> Bool[Array, " events"]:
         """Which functions are on the side from which their next zero is an event."""
-        direction = jnp.asarray([event.direction for event in self.events], int)
+        direction = jnp.asarray(
+            [event.direction for event in self.events], watch.side.dtype
+        )
         return (direction == 0) | (watch.side == -direction)
 
     def _size(self, watch: Watch, values: Array) -> Array:
