@@ -8,7 +8,7 @@ import pytest
 import enerjax as ej
 
 
-# A ball that falls from a height on a floor ------------------------------------------------
+# A ball that falls from a height on a floor ----------------------------------------------
 
 BALL = ej.System(jnp.eye(1), lambda q, args: args["g"] * q[0])
 # Of a ball from height 1 with g = 9.81 and restitution 0.9: the bounces, in closed form.
@@ -87,11 +87,12 @@ def test_derivatives_through_a_bounce_are_those_of_the_closed_form():
 
     end = lambda x: falling(x, t1, max_steps=90).ys.q[-1, 0]
     numbers = jnp.array([1.0, 0.9, 9.81, 0.01])
-    value, forward = jax.jit(jax.value_and_grad(end))(numbers), jax.jit(jax.jacfwd(end))
-    np.testing.assert_allclose(value[0], exact(numbers), rtol=1e-13)
+    value, slope = jax.jit(jax.value_and_grad(end))(numbers)
+    np.testing.assert_allclose(value, exact(numbers), rtol=1e-13)
     # Round-off. The step has no influence, so its derivative is zero.
-    np.testing.assert_allclose(value[1], jax.grad(exact)(numbers), atol=1e-12)
-    np.testing.assert_allclose(forward(numbers), value[1], atol=1e-12)
+    np.testing.assert_allclose(slope, jax.grad(exact)(numbers), atol=1e-12)
+    _, forward = jax.jit(lambda x: jax.jvp(end, (x,), (jnp.ones_like(x),)))(numbers)
+    np.testing.assert_allclose(forward, jnp.sum(slope), atol=1e-12)
 
 
 def test_lanes_have_events_of_their_own():
@@ -109,9 +110,9 @@ def test_lanes_have_events_of_their_own():
     assert list(np.asarray(batch.events.count)) == [2, 1, 0, 1]
 
 
-# A rigid pendulum that hits a stop -----------------------------------------------------------
+# A rigid pendulum that hits a stop -------------------------------------------------------
 
-# A point on a rod of length 1 hits a wall at x = 0.5; no gravity gap is tangential there.
+# A point on a rod of length 1 that hits a wall at x = 0.5.
 PENDULUM = ej.System(
     jnp.eye(2),
     lambda q, args: 9.81 * q[1],
@@ -144,7 +145,7 @@ def elastic():
 
 def test_elastic_hits_keep_energy_and_constraints(elastic):
     audit = elastic.audit
-    assert int(elastic.events.count) >= 15
+    assert int(elastic.events.count) == 12
     # Round-off of all steps, against a kinetic energy of 2.
     assert np.abs(audit.energy - audit.energy[0]).max() < 1e-12
     assert np.abs(audit.impact).max() < 1e-13
@@ -189,12 +190,12 @@ def test_times_of_events_have_the_order_of_the_scheme(scheme, order):
     )
     errors = []
     for steps in (8, 16):
-        sol = swinging(0.8 / steps, 1.0, steps, scheme, max_events=2)
+        sol = swinging(1.28 / steps, 1.0, steps, scheme, max_events=2)
         errors.append(abs(float(sol.events.ts[0]) - exact))
     assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.4)
 
 
-# What events do -------------------------------------------------------------------------------
+# What events do --------------------------------------------------------------------------
 
 
 def below(q, v, t, args):
@@ -258,7 +259,7 @@ def test_more_events_than_allowed_are_a_failure():
     assert sol.result == ej.RESULTS.too_many_events
 
 
-# Bad input ------------------------------------------------------------------------------------
+# Bad input -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

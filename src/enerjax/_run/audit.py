@@ -31,8 +31,9 @@ class Audit(eqx.Module):
       the row before.
     - `leak`: shape `(times,)`, the change of the energy that the others do not explain,
       `energy[k] = energy[k-1] + work[k] + drive_work[k] - dissipated[k] - impact[k] +
-      leak[k]`. It consists of round-off, the residual of Newton's method, and the error of schemes
-      without an energy identity. If it is far above round-off, do not trust the run.
+      leak[k]`. It consists of round-off, the residual of Newton's method, and the error of
+      schemes without an energy identity. If it is far above round-off, do not trust the
+      run.
     - `momentum`: shape `(times, ns)`, of each `symmetry` of the system.
     - `constraint`: shape `(times, nc)`, residuals of joints, driven constraints and
       relations between coordinates, each in its own unit.

@@ -328,7 +328,7 @@ class _AtGrid(AbstractSaving):
         is_used = numbers - self.every < plan.last
         places = jnp.minimum(numbers, plan.last)
         ends = jax.lax.stop_gradient(ends)
-        last = jnp.searchsorted(ends, places[1:] - 2 * NEAR)
+        last = jnp.searchsorted(ends, places[1:] - 2 * NEAR).astype(completed.dtype)
         valid = last < completed
         picked = jax.tree.map(lambda x: x[jnp.where(valid, last, 0)], steps)
         segment = jnp.minimum(jnp.searchsorted(last, _number_of_step(record)), count)

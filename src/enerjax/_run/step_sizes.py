@@ -189,7 +189,7 @@ class _EqualPlan(AbstractPlan):
     last: Scalar
     max_attempts: int = eqx.field(static=True)
     is_counted: bool = eqx.field(static=True)
-    # Whether an event may end a step early. The next step then leads to the end of this one.
+    # Whether an event may end a step early. The next step then leads to its planned end.
     may_end_early: bool = eqx.field(static=True, default=False)
 
     def begin(self, model: AbstractModel, start: State) -> None:
