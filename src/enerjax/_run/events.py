@@ -167,7 +167,7 @@ class Impact(AbstractEvent):
         rate, slope = jax.value_and_grad(rate_of)(v)
         # The change of the velocities by a unit impulse, with all constraints held.
         admitted = lambda v: project_velocity(model, State(q, v, state.t), ())[0]
-        change = admitted(v + model.inverse_metric(state) @ slope) - admitted(v)
+        change = admitted(v + model.inverse_regular_metric(state) @ slope) - admitted(v)
         e = self.restitution(model.args) if callable(self.restitution) else self.restitution
         target, gain = -jnp.asarray(e, rate.dtype) * rate, slope @ change
         # One correction is exact where the rate is linear in the velocities or momenta.
