@@ -1,5 +1,7 @@
 """Events that end steps exactly, and impacts."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +22,7 @@ def height(q, args):
     return q[0]
 
 
-def falling(numbers, t1=4.5, events=None, **options):
+def falling(numbers, t1=4.5, events: Any = None, **options: Any) -> Any:
     """A run of the ball from numbers (height, restitution, g, step)."""
     h0, e, g, h = numbers
     start = ej.State(jnp.stack([h0]), jnp.zeros(1))
@@ -32,7 +34,7 @@ def falling(numbers, t1=4.5, events=None, **options):
         h=h,
         t1=t1,
         events=ej.Impact(height, e) if events is None else events,
-        **dict(max_events=20, max_steps=450) | options,
+        **{"max_events": 20, "max_steps": 450, **options},
     )
 
 
@@ -125,7 +127,7 @@ def to_wall(q, args):
     return WALL - q[0]
 
 
-def swinging(h, e, num_steps, scheme=None, **options):
+def swinging(h, e, num_steps, scheme=None, **options: Any) -> Any:
     start = ej.initial_state(PENDULUM, [-0.6, -0.8], [0.0, 0.0])
     return ej.simulate(
         PENDULUM,
@@ -219,7 +221,7 @@ def test_a_direction_selects_zeros():
     assert [int(n) for n in swings] == [2, 4, 2]
 
 
-def swinging_freely(direction):
+def swinging_freely(direction) -> Any:
     start = ej.State([1.0], [0.0])
     spring = ej.System(jnp.eye(1), lambda q, args: 0.5 * q @ q)
     event = ej.Event(lambda q, v, t, args: q[0], direction=direction)
@@ -261,13 +263,15 @@ def test_more_events_than_allowed_are_a_failure():
 
 # Bad input -------------------------------------------------------------------------------
 
+NO_FUNCTION: Any = 1.0
+
 
 @pytest.mark.parametrize(
     ("make", "error", "words"),
     [
-        (lambda: ej.Event(1.0), TypeError, "`fn` must be a function"),
+        (lambda: ej.Event(NO_FUNCTION), TypeError, "`fn` must be a function"),
         (lambda: ej.Event(below, direction=2), ValueError, "direction"),
-        (lambda: ej.Impact(0.0), TypeError, "`gap` must be a function"),
+        (lambda: ej.Impact(NO_FUNCTION), TypeError, "`gap` must be a function"),
         (lambda: ej.Impact(height, 1.5), ValueError, r"\[0, 1\]"),
     ],
 )

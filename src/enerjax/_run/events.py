@@ -14,6 +14,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 from typing_extensions import TypeAliasType
 
@@ -75,9 +76,9 @@ class Event(AbstractEvent):
     """
 
     fn: StateFunction
-    direction: int = eqx.field(static=True, default=0)
-    terminal: bool = eqx.field(static=True, default=False)
-    reset: StateFunction | None = None
+    direction: int = eqx.field(static=True, default=0, kw_only=True)
+    terminal: bool = eqx.field(static=True, default=False, kw_only=True)
+    reset: StateFunction | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):
         for name in ("fn", "reset"):
@@ -147,7 +148,8 @@ class Impact(AbstractEvent):
         if not callable(self.gap):
             raise TypeError(f"`gap` must be a function of (q, args), got {self.gap!r}.")
         e = self.restitution
-        if not callable(e) and is_known(e) and not 0 <= float(e) <= 1:
+        known = None if callable(e) or not is_known(e) else np.asarray(e)
+        if known is not None and not np.all((known >= 0) & (known <= 1)):
             raise ValueError(f"`restitution` must be in [0, 1], got {e}.")
 
     @property
