@@ -183,8 +183,8 @@ FAULTS = (
     Fault(
         "saving: the last row",
         "_run/saving.py",
-        "        is_used = numbers - self.every < plan.last\n",
-        "        is_used = numbers <= plan.last\n",
+        "        is_used = numbers - self.every < plan.last\n        ts = jnp",
+        "        is_used = numbers <= plan.last\n        ts = jnp",
         "A last row that holds fewer steps than the others has no time.",
         of("saving::test_the_end_is_a_row_where_the_steps_do_not_fill_the_last_one"),
     ),

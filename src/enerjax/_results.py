@@ -54,6 +54,16 @@ class RESULTS(eqx.Enumeration):
         "about 1e-14 of the coordinates. Or the motion has a singularity here, such as a "
         "collision."
     )
+    event_not_found = (
+        "A function of an event passes a zero in this step, but no step ends there. The "
+        "function may jump, such as an angle that is reduced to a turn, or may touch zero "
+        "again and again: write it as a smooth function."
+    )
+    too_many_events = (
+        "More events happened than `max_events`. Raise `max_events` if they are wanted. "
+        "Bounces that become ever shorter have no end: let a terminal event end the run "
+        "before, or lengthen the run only to where they accumulate."
+    )
     interrupted = (
         "The run was interrupted. The same call with `resume=solution`, or with the same "
         "`checkpoint`, makes the rest."
@@ -71,6 +81,8 @@ _NAMES = (
     "kappa_out_of_range",
     "out_of_steps",
     "steps_too_short",
+    "event_not_found",
+    "too_many_events",
     "interrupted",
 )
 

@@ -1,5 +1,11 @@
 from .audit import Audit as Audit
 from .controller import StepController as StepController
+from .events import (
+    AbstractEvent as AbstractEvent,
+    Event as Event,
+    Events as Events,
+    Impact as Impact,
+)
 from .inputs import positive_integer as positive_integer
 from .reached import (
     must_be_close as must_be_close,

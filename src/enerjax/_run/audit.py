@@ -27,10 +27,13 @@ class Audit(eqx.Module):
     - `damped`: shape `(times,)`, the energy that dampers removed since the row before:
       minus the work of `(f(q, v, t) - f(q, -v, t))/2`, the part of `force` that changes its
       sign with the velocity.
+    - `impact`: shape `(times,)`, the energy that impacts and resets of events removed since
+      the row before.
     - `leak`: shape `(times,)`, the change of the energy that the others do not explain,
-      `energy[k] = energy[k-1] + work[k] + drive_work[k] - dissipated[k] + leak[k]`. It
-      consists of round-off, the residual of Newton's method, and the error of schemes
-      without an energy identity. If it is far above round-off, do not trust the run.
+      `energy[k] = energy[k-1] + work[k] + drive_work[k] - dissipated[k] - impact[k] +
+      leak[k]`. It consists of round-off, the residual of Newton's method, and the error of
+      schemes without an energy identity. If it is far above round-off, do not trust the
+      run.
     - `momentum`: shape `(times, ns)`, of each `symmetry` of the system.
     - `constraint`: shape `(times, nc)`, residuals of joints, driven constraints and
       relations between coordinates, each in its own unit.
@@ -44,6 +47,7 @@ class Audit(eqx.Module):
     work: Float[Array, " times"]
     damped: Float[Array, " times"]
     drive_work: Float[Array, " times"]
+    impact: Float[Array, " times"]
     momentum: Float[Array, "times ns"]
     constraint: Float[Array, "times nc"]
     constraint_rate: Float[Array, "times nj"]
@@ -55,7 +59,7 @@ class Audit(eqx.Module):
     @property
     def leak(self) -> Float[Array, " times"]:
         change = jnp.diff(self.energy, prepend=self.energy[..., :1])
-        return change - self.work - self.drive_work + self.dissipated
+        return change - self.work - self.drive_work + self.dissipated + self.impact
 
     def __str__(self) -> str:
         return _report(self) if is_known(self) else repr(self)
@@ -92,6 +96,7 @@ def audit(rows: Measures, energies: Energies) -> Audit:
         work=none if energies.work is None else energies.work,
         damped=none if energies.damped is None else energies.damped,
         drive_work=none if energies.drive_work is None else energies.drive_work,
+        impact=none if energies.impact is None else energies.impact,
         momentum=rows.momentum,
         constraint=rows.constraint,
         constraint_rate=rows.constraint_rate,
@@ -111,6 +116,7 @@ def _report(audit: Audit) -> str:
         ("  work of forces", total(audit.work)),
         ("    of these, taken by dampers", total(audit.damped)),
         ("  work of drives", total(audit.drive_work)),
+        ("  removed by impacts and resets", total(audit.impact)),
         ("  unaccounted for (sum)", total(audit.leak)),
         ("  unaccounted for (largest row)", largest(audit.leak)),
         ("largest kinetic energy", largest(audit.kinetic)),

@@ -14,15 +14,19 @@ from .._solvers import RootFinder
 from .._system import State
 from .._types import Count, Flag, Multipliers, Scalar
 from ..schemes import AbstractScheme, Energies
+from .event_search import Found, Happening, no_search, settle, Watch, Watcher
 from .halving import select
 from .reverse import keep_roots, loops
 from .saving import Begin, Costs, Record, with_time
-from .step import advance, first_warm, Warm
-from .step_sizes import AbstractPlan
+from .step import advance, first_warm, StepOutput, Warm
+from .step_sizes import AbstractPlan, Verdict
 
 
 class Progress(eqx.Module):
-    """The carry of the loop over the steps; after a failure, that of the last good step."""
+    """The carry of the loop over the steps; after a failure, that of the last good step.
+
+    `watch` is `None` in a run without events.
+    """
 
     state: State
     warm: Warm
@@ -31,6 +35,7 @@ class Progress(eqx.Module):
     result: RESULTS
     completed: Count
     multipliers: Multipliers
+    watch: Watch | None = None
 
 
 class Stepper(eqx.Module):
@@ -41,6 +46,7 @@ class Stepper(eqx.Module):
     plan: AbstractPlan
     root_finder: RootFinder
     max_halvings: int | None = eqx.field(static=True)
+    watcher: Watcher | None = None
 
     def begin(self, start: State) -> Progress:
         """The carry at the start of a run; `start` is a state of the model."""
@@ -57,50 +63,37 @@ class Stepper(eqx.Module):
             result=_check_start(scheme, model, timed, h),
             completed=jnp.array(0),
             multipliers=multipliers,
+            watch=self.watcher and self.watcher.begin(model, timed, plan.time(place)),
         )
 
     def attempt(self, before: Progress, live: Flag) -> tuple[Progress, "Attempt"]:
         """Attempts one step. If `live` is false nothing changes, at no cost."""
         model, plan = self.model, self.plan
+        if self.watcher is not None:
+            return attempt_with_events(self, self.watcher, before, live)
         place, length = plan.next(before.memory, before.place)
         # A step that is not live gets a positive length, so that no derivative is NaN.
         length = jnp.where(live, length, plan.first())
         begin = with_time(model, plan, before.state, before.place)
-        out = advance(
+        out = self.advance(before, begin, length, live)
+        ends = model.to_rates(begin), model.to_rates(out.state)
+        verdict = plan.judge(before.memory, model.in_rates, ends, out.result, length)
+        return _advanced(self, before, live, place, out, verdict)
+
+    def advance(
+        self, before: Progress, begin: State, length: Scalar, live: Flag
+    ) -> StepOutput:
+        """The step of a length, in units of the plan, from the state `begin`."""
+        plan = self.plan
+        return advance(
             self.scheme,
-            model,
+            self.model,
             begin,
             plan.unit * length,
             plan.warm(before.memory, before.warm, length),
             self.root_finder,
             ~live,
             self.max_halvings,
-        )
-        ends = model.to_rates(begin), model.to_rates(out.state)
-        verdict = plan.judge(before.memory, model.in_rates, ends, out.result, length)
-        good = live & verdict.accepted
-        result = RESULTS.where(live, verdict.result, RESULTS.successful)
-        keep = lambda new, old: select(good, new, old)
-        after = Progress(
-            state=keep(State(out.state.q, out.state.v), before.state),
-            warm=keep(plan.kept(out.warm, before.warm), before.warm),
-            place=keep(place, before.place),
-            memory=select(live, verdict.memory, before.memory),
-            result=first_failure(before.result, result),
-            completed=before.completed + good.astype(before.completed.dtype),
-            multipliers=keep(out.multipliers, before.multipliers),
-        )
-        zero_unless = lambda flag, x: jnp.where(flag, x, jnp.zeros_like(x))
-        return after, Attempt(
-            energies=jax.tree.map(lambda x: zero_unless(good, x), out.energies),
-            details=out.details,
-            costs=Costs(
-                iterations=zero_unless(live, out.newton_iterations),
-                residual=zero_unless(live, out.residual),
-                halvings=zero_unless(live, out.halvings),
-                local_error=zero_unless(good, out.local_error),
-            ),
-            accepted=good,
         )
 
 
@@ -111,6 +104,111 @@ class Attempt(eqx.Module):
     details: PyTree[Any]
     costs: Costs
     accepted: Flag
+    happening: Happening | None = None
+
+
+def _advanced(
+    stepper: Stepper,
+    before: Progress,
+    live: Flag,
+    place: Scalar,
+    out: StepOutput,
+    verdict: Verdict,
+) -> tuple[Progress, Attempt]:
+    """The run after an attempted step on which the plan has decided, and its report."""
+    good = live & verdict.accepted
+    result = RESULTS.where(live, verdict.result, RESULTS.successful)
+    keep = lambda new, old: select(good, new, old)
+    after = Progress(
+        state=keep(State(out.state.q, out.state.v), before.state),
+        warm=keep(stepper.plan.kept(out.warm, before.warm), before.warm),
+        place=keep(place, before.place),
+        memory=select(live, verdict.memory, before.memory),
+        result=first_failure(before.result, result),
+        completed=before.completed + good.astype(before.completed.dtype),
+        multipliers=keep(out.multipliers, before.multipliers),
+        watch=before.watch,
+    )
+    zero_unless = lambda flag, x: jnp.where(flag, x, jnp.zeros_like(x))
+    return after, Attempt(
+        energies=jax.tree.map(lambda x: zero_unless(good, x), out.energies),
+        details=out.details,
+        costs=Costs(
+            iterations=zero_unless(live, out.newton_iterations),
+            residual=zero_unless(live, out.residual),
+            halvings=zero_unless(live, out.halvings),
+            local_error=zero_unless(good, out.local_error),
+        ),
+        accepted=good,
+    )
+
+
+class _AttemptWithEvents(eqx.Module):
+    """An attempted step and the search for events in it; see `settle`."""
+
+    stepper: Stepper
+    watcher: Watcher
+    before: Progress
+    length: Scalar
+    live: Flag
+
+    def run(self) -> tuple[StepOutput, Found]:
+        before, plan, model = self.before, self.stepper.plan, self.stepper.model
+        begin = with_time(model, plan, before.state, before.place)
+        out = self.stepper.advance(before, begin, self.length, self.live)
+        assert before.watch is not None
+        end = plan.t0 + plan.unit * (before.place + self.length)
+        values = self.watcher.values(model, out.state, end)
+        found = self.watcher.find(before.watch, values, self.length, before.place)
+        return out, found
+
+
+def attempt_with_events(
+    stepper: Stepper, watcher: Watcher, before: Progress, live: Flag
+) -> tuple[Progress, Attempt]:
+    """Attempts one step, which is repeated with another length if it passes an event."""
+    model, plan, watch = stepper.model, stepper.plan, before.watch
+    assert watch is not None
+    place, length = plan.next(before.memory, before.place)
+    searching = watch.search.active
+    length = jnp.where(searching, watch.search.length, length)
+    length = jnp.where(live, length, plan.first())
+    out, length, found = settle(_AttemptWithEvents(stepper, watcher, before, length, live))
+    happens = found.happens & live
+    place = jnp.where(searching | jnp.any(happens), before.place + length, place)
+    begin = with_time(model, plan, before.state, before.place)
+    ends = model.to_rates(begin), model.to_rates(out.state)
+    verdict = plan.judge(before.memory, model.in_rates, ends, out.result, length)
+    searches = verdict.accepted & found.searches
+    too_many = jnp.any(happens) & (watch.count >= watcher.max_events)
+    result = RESULTS.where(too_many, RESULTS.too_many_events, found.result)
+    result = RESULTS.where(verdict.accepted, result, RESULTS.successful)
+    verdict = Verdict(
+        accepted=verdict.accepted & ~found.searches & ~too_many,
+        result=first_failure(verdict.result, result),
+        memory=select(searches, before.memory, verdict.memory),
+    )
+    happens = happens & verdict.accepted
+    t = plan.time(place)
+    state, lost = watcher.after(model, out.state, t, happens)
+    happening = Happening(happens, model.to_rates(out.state), model.to_rates(state))
+    energies = eqx.tree_at(
+        lambda x: x.impact, out.energies, lost, is_leaf=lambda x: x is None
+    )
+    out = eqx.tree_at(lambda x: (x.state, x.energies), out, (state, energies))
+    after, attempt = _advanced(stepper, before, live, place, out, verdict)
+    search = select(searches & live, found.search, no_search(length.dtype))
+    waiting = eqx.tree_at(lambda x: x.search, watch, search)
+    moved = watcher.watch_after(
+        watch, model, with_time(model, plan, state, place), t, happens
+    )
+    good = live & verdict.accepted
+    after = eqx.tree_at(
+        lambda x: x.watch, after, select(good, moved, select(live, waiting, watch))
+    )
+    return after, eqx.tree_at(
+        lambda x: x.happening, attempt, happening, is_leaf=lambda x: x is None
+    )
 
 
 def run_loop(
@@ -130,6 +228,8 @@ def run_loop(
     def is_done(progress: Progress) -> Flag:
         failed = progress.result != RESULTS.successful
         done = failed | (progress.place >= plan.last)
+        if progress.watch is not None:
+            done = done | progress.watch.ended
         return done if is_whole else done | (progress.completed >= plan.max_attempts)
 
     over_groups, over_steps = loops(
@@ -151,14 +251,16 @@ def run_loop(
             costs=attempts.costs.total(),
             place=after.place,
             reached=jnp.any(attempts.accepted) & (after.result == RESULTS.successful),
+            happening=jax.tree.map(lambda x: x[last], attempts.happening),
         )
 
     begin = stepper.begin(start)
     kept = Begin(keep(begin.state, begin.place), begin.multipliers)
     end, record = over_groups(one_group, begin, num_groups, jnp.array(True))
-    arrived = RESULTS.where(
-        end.place >= plan.last, RESULTS.successful, RESULTS.out_of_steps
-    )
+    is_whole_run = end.place >= plan.last
+    if end.watch is not None:
+        is_whole_run = is_whole_run | end.watch.ended
+    arrived = RESULTS.where(is_whole_run, RESULTS.successful, RESULTS.out_of_steps)
     result = first_failure(end.result, arrived)
     return kept, eqx.tree_at(lambda x: x.result, end, result), record
 

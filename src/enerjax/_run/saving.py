@@ -17,8 +17,9 @@ from .._system import State
 from .._types import Args, Count, Flag, Multipliers, Scalar, Times, Vector
 from ..schemes import Energies
 from .collocation import state_within
+from .event_search import Happening
 from .inputs import positive_integer
-from .step_sizes import AbstractController, AbstractPlan, EqualSteps
+from .step_sizes import AbstractController, AbstractPlan, EqualSteps, NEAR
 
 
 SaveFunction = TypeAliasType("SaveFunction", Callable[[Scalar, State, Args], PyTree[Any]])
@@ -142,6 +143,7 @@ class Record(eqx.Module):
     - `costs`: of all attempted steps together.
     - `place`: how far the run has come, see `AbstractPlan`.
     - `reached`: whether a step of the group was accepted, and none failed.
+    - `happening`: the events at the end of the group; `None` in a run without events.
     """
 
     kept: PyTree[Any]
@@ -151,6 +153,7 @@ class Record(eqx.Module):
     costs: Costs
     place: Float[Array, " groups"]
     reached: Bool[Array, " groups"]
+    happening: Happening | None = None
 
 
 class Begin(eqx.Module):
@@ -243,6 +246,14 @@ def saving_of(
     return _EveryAcceptedStep(min(every, max_every))
 
 
+def with_events(saving: AbstractSaving, plan: AbstractPlan) -> AbstractSaving:
+    """The saving of the same rows in a run whose steps may end early."""
+    if isinstance(saving, _AtBothEnds | _EveryEqualStep):
+        every = getattr(saving, "every", plan.max_attempts)
+        return _AtGrid(every, plan.max_attempts)
+    return saving
+
+
 class _AtBothEnds(AbstractSaving):
     """The start and the end."""
 
@@ -291,6 +302,47 @@ class _EveryEqualStep(AbstractSaving):
 
     def of_groups(self) -> "_EveryEqualStep":
         return self
+
+
+class _AtGrid(AbstractSaving):
+    """The start, the ends of every `every`-th equal step, and the end, where events end
+    steps early: a row is found by its place.
+    """
+
+    keeps_rows = False
+    every: int = eqx.field(static=True)
+    num_steps: int = eqx.field(static=True)
+
+    def steps_in_group(self, plan: AbstractPlan) -> int:
+        return 1
+
+    def num_rows(self, plan: AbstractPlan) -> int:
+        return 1 - (-self.num_steps // self.every)
+
+    def rows(self, run: RecordedRun) -> Rows:
+        plan, record, completed = run.plan, run.record, run.completed
+        steps = _accepted_first(record)
+        ends = jnp.where(jnp.arange(record.reached.size) < completed, steps.place, jnp.inf)
+        count = self.num_rows(plan) - 1
+        numbers = self.every * jnp.arange(count + 1, dtype=plan.last.dtype)
+        is_used = numbers - self.every < plan.last
+        places = jnp.minimum(numbers, plan.last)
+        ends = jax.lax.stop_gradient(ends)
+        last = jnp.searchsorted(ends, places[1:] - 2 * NEAR).astype(completed.dtype)
+        valid = last < completed
+        picked = jax.tree.map(lambda x: x[jnp.where(valid, last, 0)], steps)
+        segment = jnp.minimum(jnp.searchsorted(last, _number_of_step(record)), count)
+        energies = _energies_by_segment(record.energies, segment, count)
+        costs = record.costs.by_segment(segment, count)
+        picked = eqx.tree_at(lambda x: (x.energies, x.costs), picked, (energies, costs))
+        ts = jnp.where(is_used, jax.vmap(plan.time)(places), jnp.nan)
+        return _after_start(run.begin, picked, valid & is_used[1:], ts)
+
+    def is_due(self, plan: AbstractPlan, standing: Standing) -> Flag:
+        raise NotImplementedError
+
+    def of_groups(self) -> "_AtGrid":
+        raise NotImplementedError
 
 
 class _EveryAcceptedStep(AbstractSaving):

@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import sys
+from collections.abc import Sequence
 
 from .._programs import at_top_level, compiled
 from .._progress import Progress
@@ -10,11 +11,13 @@ from .._solvers import Newton, RootFinder
 from .._system import AbstractSystem, State
 from .._types import Args, Real, Scalar
 from ..schemes import AbstractScheme
+from .event_search import watcher_of
+from .events import AbstractEvent
 from .failure import explained_memory_error, raise_failure
 from .inputs import check_halvings, prepare
 from .long_run import checked_options, run_long
 from .loop import run_loop
-from .saving import RecordedRun, SaveAt, saving_of
+from .saving import RecordedRun, SaveAt, saving_of, with_events
 from .solution import first_rows, Solution
 from .step_sizes import AbstractController, EqualSteps, find_end
 from .task import Task
@@ -35,6 +38,8 @@ def simulate(
     max_steps: int | None = None,
     root_finder: RootFinder = Newton(),
     max_halvings: int | None = None,
+    events: AbstractEvent | Sequence[AbstractEvent] = (),
+    max_events: int = 64,
     progress: Progress = False,
     checkpoint: str | os.PathLike | None = None,
     checkpoint_seconds: Real = 60.0,
@@ -78,6 +83,13 @@ def simulate(
       steps, for which the energy identity holds as well; 0 disables this. The default is 3
       for systems with many unknowns, else 0, because it lengthens the compilation.
       `stats.halvings` shows where steps were divided.
+    - `events`: an `Event`, an `Impact`, or a list of them: zeros of functions of the state,
+      at which a step ends exactly, and after which the state may be another one. They are
+      listed in `Solution.events`. Every event is found that changes the sign of its
+      function between the ends of a step; a function that does so twice within a step
+      is not seen, unless it is zero at the start after a change of the state.
+    - `max_events`: the number of times at which events may happen; a run that needs more
+      fails.
     - `progress`: `True` for a line on stderr that shows how far the run is, or a function
       that is called with the time that has passed in the motion and its duration.
     - `checkpoint`: a file in which the run so far is kept. If it exists, the run continues
@@ -115,16 +127,22 @@ def simulate(
     end = find_end(num_steps, t1, max_steps, controller, h, t0, step.dtype)
     plan = controller.plan(scheme, step, begin, end)
     longest = plan.max_attempts if options is None else sys.maxsize
+    saving = saving_of(saveat, plan, controller, longest)
+    watcher = watcher_of(events, max_events, scheme, options is not None)
+    if watcher is not None:
+        saving = with_events(saving, plan)
+        plan = plan.with_events(watcher.max_attempts)
     task = Task(
         system=system,
         scheme=scheme,
         start=start,
         args=args,
         plan=plan,
-        saving=saving_of(saveat, plan, controller, longest),
+        saving=saving,
         fn=saveat.fn,
         root_finder=root_finder,
         max_halvings=max_halvings,
+        watcher=watcher,
     )
     num_rows = task.saving.num_rows(plan)
     with explained_memory_error(plan.max_attempts):
@@ -140,7 +158,7 @@ def simulate(
 
 def _whole(task: Task, num_rows: int) -> tuple[Solution, Scalar]:
     """A run in one piece, and the time that it has reached."""
-    if at_top_level(task):
+    if at_top_level(task) and task.watcher is None:
         task = dataclasses.replace(task, plan=task.plan.rounded_up())
     solution, reached = _run(task)
     if solution.ts.size > num_rows:
@@ -165,4 +183,8 @@ def _run(task: Task) -> tuple[Solution, Scalar]:
         completed=end.completed,
         order=task.scheme.order,
     )
-    return task.solution(model, saving.rows(run), end), plan.time(end.place)
+    solution = task.solution(model, saving.rows(run), end)
+    if task.watcher is not None:
+        happened = task.events(model, record)
+        solution = dataclasses.replace(solution, events=happened)
+    return solution, plan.time(end.place)

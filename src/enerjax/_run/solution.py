@@ -13,6 +13,7 @@ from .._results import RESULTS, tally
 from .._system import Names, State
 from .._types import Count, Scalar
 from .audit import Audit
+from .events import Events
 
 
 class Statistics(eqx.Module):
@@ -73,6 +74,7 @@ class Solution(eqx.Module):
     - `end`: the last state that was reached, after `stats.completed_steps` steps: the last
       row, or the state in which a failed step began. A further run can start from it.
     - `result`: `RESULTS.successful`, or the first failure.
+    - `events`: the times of events, and the states on both sides; `None` in a run without.
     - `names`: those of the system, for tables.
     - `continuation`: what the next step needs, of a run with `progress`, `checkpoint` or
       `resume`; else `None`.
@@ -98,6 +100,7 @@ class Solution(eqx.Module):
     stats: Statistics
     end: State
     result: RESULTS
+    events: Events | None = None
     names: Names | None = None
     continuation: Continuation | None = None
 

@@ -106,6 +106,14 @@ class AbstractPlan(eqx.Module):
         Runs with the same numbers make the same steps, up to the end of the shorter one.
         """
 
+    def with_events(self, attempts: int) -> "AbstractPlan":
+        """The same steps, some of which end early; `attempts` more may be needed."""
+        more = self.max_attempts + attempts
+        changes: dict[str, Any] = dict(max_attempts=more, is_counted=False)
+        if isinstance(self, _EqualPlan):
+            changes["may_end_early"] = True
+        return dataclasses.replace(self, **changes)
+
     def unlimited(self) -> "AbstractPlan":
         """The same steps, without a limit on their number."""
         return dataclasses.replace(self, max_attempts=sys.maxsize, is_counted=False)
@@ -170,6 +178,10 @@ class EqualSteps(AbstractController):
         )
 
 
+# The fraction of an equal step that is too short for a step of its own.
+NEAR = 1e-12
+
+
 class _EqualPlan(AbstractPlan):
     t0: Scalar
     t1: Scalar
@@ -177,6 +189,8 @@ class _EqualPlan(AbstractPlan):
     last: Scalar
     max_attempts: int = eqx.field(static=True)
     is_counted: bool = eqx.field(static=True)
+    # Whether an event may end a step early. The next step then leads to its planned end.
+    may_end_early: bool = eqx.field(static=True, default=False)
 
     def begin(self, model: AbstractModel, start: State) -> None:
         return None
@@ -185,7 +199,10 @@ class _EqualPlan(AbstractPlan):
         return jnp.ones_like(self.unit)
 
     def next(self, memory: None, place: Scalar) -> tuple[Scalar, Scalar]:
-        return place + 1, self.first()
+        if not self.may_end_early:
+            return place + 1, self.first()
+        following = jnp.floor(place + 1 + NEAR)
+        return following, following - place
 
     def warm(self, memory: None, warm: Warm, length: Scalar) -> Warm:
         return warm

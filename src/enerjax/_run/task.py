@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from .._operators import AbstractModel
 from .._solvers import RootFinder
@@ -14,8 +14,10 @@ from .._system import AbstractSystem, State
 from .._types import Args, Scalar
 from ..schemes import AbstractScheme
 from .audit import audit, Measures, measures
+from .event_search import Watcher
+from .events import Events
 from .loop import Progress, Stepper
-from .saving import AbstractSaving, Rows, SaveFunction
+from .saving import AbstractSaving, Record, Rows, SaveFunction
 from .solution import Solution, Statistics
 from .step import model_for
 from .step_sizes import AbstractPlan
@@ -33,6 +35,7 @@ class Task(eqx.Module):
     fn: SaveFunction | None
     root_finder: RootFinder
     max_halvings: int | None
+    watcher: Watcher | None = None
 
     def stepper(self) -> Stepper:
         return Stepper(
@@ -41,6 +44,7 @@ class Task(eqx.Module):
             plan=self.plan,
             root_finder=self.root_finder,
             max_halvings=self.max_halvings,
+            watcher=self.watcher,
         )
 
     @property
@@ -75,6 +79,32 @@ class Task(eqx.Module):
             value = jax.tree.map(jnp.asarray, self.fn(t, value, self.args))
         timed = State(state.q, state.v, t if self.system.is_timed else None)
         return value, measures(model.in_rates, timed)
+
+    def events(self, model: AbstractModel, record: Record) -> Events | None:
+        """The events of a run, from the record of all its attempted steps."""
+        if self.watcher is None:
+            return None
+        happening = record.happening
+        assert happening is not None
+        happened = jnp.any(happening.happens, axis=1)
+        numbers = jnp.arange(self.watcher.max_events)
+        at = jnp.searchsorted(jnp.cumsum(happened), numbers + 1)
+        count = jnp.sum(happened)
+        is_event = numbers < count
+        user = jax.vmap(model.in_rates.to_user)
+
+        def picked(x: Array) -> Array:
+            x = x[jnp.minimum(at, happened.size - 1)]
+            valid = is_event.reshape(-1, *[1] * (x.ndim - 1))
+            return jnp.where(valid, x, False if x.dtype == bool else jnp.nan)
+
+        return Events(
+            ts=picked(jax.vmap(self.plan.time)(record.place)),
+            happened=picked(happening.happens),
+            before=jax.tree.map(picked, user(happening.before)),
+            after=jax.tree.map(picked, user(happening.after)),
+            count=count,
+        )
 
     def solution(self, model: AbstractModel, rows: Rows, end: Progress) -> Solution:
         """The solution with these rows, of a run that has ended."""

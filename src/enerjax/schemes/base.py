@@ -48,18 +48,20 @@ class Energies(eqx.Module):
     - `damped`: the energy that dampers remove: minus the work of the part of the forces
       that is odd in the velocity.
     - `drive_work`: the work of the driven constraints.
+    - `impact`: the energy that events remove at the end of the step; schemes leave it out.
 
     All are energies: scalars in a step, with a leading axis of saved states in a solution.
-    `work` and `damped` are `None` for a system without forces, and `drive_work` for one
-    without driven constraints. The balance is
+    `work` and `damped` are `None` for a system without forces, `drive_work` for one without
+    driven constraints, and `impact` for a run without events. The balance is
 
-        E1 = E0 - dissipated + work + drive_work
+        E1 = E0 - dissipated + work + drive_work - impact
     """
 
     dissipated: Float[Array, "..."]
     work: Float[Array, "..."] | None
     damped: Float[Array, "..."] | None
     drive_work: Float[Array, "..."] | None
+    impact: Float[Array, "..."] | None = None
 
 
 class StepProblem(eqx.Module):

@@ -1,0 +1,212 @@
+"""Events: zeros of functions of the state, at which a step ends.
+
+A step in which a function changes its sign is repeated with other lengths until it ends at
+the zero, to round-off. Each of these steps satisfies the step equations, so the state at an
+event satisfies the constraints and the energy law as every other state does. The event may
+then change the state. Derivatives of the length of the step follow from the implicit
+function theorem, for the function and the step equations together.
+"""
+
+import abc
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from typing_extensions import TypeAliasType
+
+from .._analysis import project_velocity
+from .._operators import AbstractModel
+from .._programs import is_known
+from .._system import HamiltonianSystem, State
+from .._types import Args, Coordinates, Count, Real, Scalar, Velocities
+from .inputs import positive_integer
+
+
+StateFunction = TypeAliasType(
+    "StateFunction", Callable[[Coordinates, Velocities, Scalar, Args], Any]
+)
+
+
+class AbstractEvent(eqx.Module):
+    """Something that happens at a zero of a function of the state.
+
+    - `direction`: 1 for zeros at which the function rises, -1 for those at which it falls,
+      0 for both.
+    - `terminal`: whether the run ends there.
+    """
+
+    direction: eqx.AbstractVar[int]
+    terminal: eqx.AbstractVar[bool]
+
+    @property
+    @abc.abstractmethod
+    def changes_state(self) -> bool:
+        """Whether the state after the event is another one."""
+
+    @abc.abstractmethod
+    def value(self, state: State, t: Scalar, args: Args) -> Scalar:
+        """The function whose zeros are the events; `state` is one of the user."""
+
+    @abc.abstractmethod
+    def after(self, model: AbstractModel, state: State, t: Scalar) -> State:
+        """The state after the event; both are states of `model`, which is `in_rates`."""
+
+
+class Event(AbstractEvent):
+    """A zero of `fn(q, v, t, args)`, at which the run ends or the state changes.
+
+    The step that contains the zero ends there, to round-off, and satisfies the step
+    equations. Times of events have the order of the scheme, and derivatives.
+
+    **Arguments:**
+
+    - `fn`: a scalar, smooth function of the state, in any unit.
+    - `direction`: 1 for zeros at which it rises, -1 for those at which it falls, 0 for
+      both.
+    - `terminal`: whether the run ends at the first of these zeros. Rows after it are NaN,
+      and `Solution.end` is the state at the event.
+    - `reset`: a function `reset(q, v, t, args)` that returns the pair `(q, v)` after the
+      event. It must satisfy the constraints. Leave it out if the state does not change.
+
+    **Raises:** `TypeError` for what is no function; `ValueError` for another direction.
+    """
+
+    fn: StateFunction
+    direction: int = eqx.field(static=True, default=0, kw_only=True)
+    terminal: bool = eqx.field(static=True, default=False, kw_only=True)
+    reset: StateFunction | None = eqx.field(default=None, kw_only=True)
+
+    def __check_init__(self):
+        for name in ("fn", "reset"):
+            fn = getattr(self, name)
+            if not (callable(fn) or (name == "reset" and fn is None)):
+                raise TypeError(
+                    f"`{name}` must be a function of (q, v, t, args), got {fn!r}."
+                )
+        if self.direction not in (-1, 0, 1):
+            raise ValueError(
+                "`direction` must be 1 (the function rises), -1 (it falls) or 0 (both), "
+                f"got {self.direction!r}."
+            )
+
+    @property
+    def changes_state(self) -> bool:
+        return self.reset is not None
+
+    def value(self, state: State, t: Scalar, args: Args) -> Scalar:
+        value = jnp.asarray(self.fn(state.q, state.v, t, args))
+        if value.shape != ():
+            raise ValueError(
+                f"The function `fn` of an `Event` must return a scalar, got {value.shape}."
+            )
+        return value
+
+    def after(self, model: AbstractModel, state: State, t: Scalar) -> State:
+        if self.reset is None:
+            return state
+        user = model.to_user(state)
+        q, v = (jnp.asarray(x) for x in self.reset(user.q, user.v, t, model.args))
+        if (q.shape, v.shape) != (user.q.shape, user.v.shape):
+            raise ValueError(
+                f"`reset` must return (q, v) of the shapes {user.q.shape} and "
+                f"{user.v.shape}, got {q.shape} and {v.shape}."
+            )
+        return model.to_internal(State(q, v, state.t))
+
+
+class Impact(AbstractEvent):
+    """A hit at which a `gap` closes, with Newton's law of restitution.
+
+    At the hit the rate of the gap is reversed, `rate_after = -restitution * rate_before`,
+    by an impulse along the gradient of the gap that changes no constraint and no velocity
+    constraint. The energy changes by `-(1 - restitution^2)/2 rate_before^2 / w` with the
+    inverse inertia `w` along the gradient, on the constraints; the audit counts the loss as
+    `impact`.
+
+    **Arguments:**
+
+    - `gap`: `gap(q, args)`, a scalar that must not become negative: a distance or angle.
+    - `restitution`: a number from 0 to 1, or a function of `args`.
+
+    **Raises:** `TypeError` for a gap that is no function, `ValueError` for a known
+    restitution outside of [0, 1].
+
+    **Reference:** F. Pfeiffer and C. Glocker, Multibody Dynamics with Unilateral Contacts
+    (1996), section 8, for Newton's law.
+    """
+
+    gap: Callable[[Coordinates, Args], Any]
+    restitution: Real | Callable[[Args], Any] = 1.0
+    direction: int = eqx.field(static=True, default=-1, init=False)
+    terminal: bool = eqx.field(static=True, default=False, init=False)
+
+    def __check_init__(self):
+        if not callable(self.gap):
+            raise TypeError(f"`gap` must be a function of (q, args), got {self.gap!r}.")
+        e = self.restitution
+        known = None if callable(e) or not is_known(e) else np.asarray(e)
+        if known is not None and not np.all((known >= 0) & (known <= 1)):
+            raise ValueError(f"`restitution` must be in [0, 1], got {e}.")
+
+    @property
+    def changes_state(self) -> bool:
+        return True
+
+    def value(self, state: State, t: Scalar, args: Args) -> Scalar:
+        value = jnp.asarray(self.gap(state.q, args))
+        if value.shape != ():
+            raise ValueError(f"`gap` must return a scalar, got shape {value.shape}.")
+        return value
+
+    def after(self, model: AbstractModel, state: State, t: Scalar) -> State:
+        q, v = state.q, state.v
+        normal = jax.grad(lambda q: self.value(State(q, v), t, model.args))(q)
+        rate_of = lambda v: normal @ model.lift(q, v)
+        rate, slope = jax.value_and_grad(rate_of)(v)
+        # The change of the velocities by a unit impulse, with all constraints held.
+        admitted = lambda v: project_velocity(model, State(q, v, state.t), ())[0]
+        change = admitted(v + model.inverse_regular_metric(state) @ slope) - admitted(v)
+        e = self.restitution(model.args) if callable(self.restitution) else self.restitution
+        target, gain = -jnp.asarray(e, rate.dtype) * rate, slope @ change
+        # One correction is exact where the rate is linear in the velocities or momenta.
+        corrections = 8 if isinstance(model.system, HamiltonianSystem) else 1
+
+        def correct(impulse: Scalar, _: None) -> tuple[Scalar, None]:
+            return impulse + (target - rate_of(v + impulse * change)) / gain, None
+
+        none = jnp.zeros_like(rate)
+        impulse, _ = jax.lax.scan(correct, none, None, length=corrections)
+        return State(q, jnp.where(rate < 0, v + impulse * change, v), state.t)
+
+
+def checked_events(events: Any, max_events: Any) -> tuple[tuple[AbstractEvent, ...], int]:
+    """The events as a tuple, and the checked bound on their number."""
+    if isinstance(events, AbstractEvent):
+        events = (events,)
+    if not isinstance(events, Sequence) or not all(
+        isinstance(event, AbstractEvent) for event in events
+    ):
+        raise TypeError(
+            f"`events` must be an `Event`, an `Impact`, or a list of them, got {events!r}."
+        )
+    return tuple(events), positive_integer("max_events", max_events)
+
+
+class Events(eqx.Module):
+    """The events of a run, in the order of time. Entries after the last event are NaN.
+
+    - `ts`: their times, shape `(max_events,)`.
+    - `happened`: which events happened at each time, shape `(max_events, events)`.
+    - `before`, `after`: the states on both sides, with `q` of shape `(max_events, nq)`.
+    - `count`: the number of times.
+    """
+
+    ts: Float[Array, " max_events"]
+    happened: Bool[Array, "max_events events"]
+    before: State
+    after: State
+    count: Count
