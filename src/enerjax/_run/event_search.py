@@ -5,22 +5,24 @@ zero, the step is repeated with lengths that enclose the first zero, by the Illi
 regula falsi, until the function is round-off at the end of the step.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from .._operators import AbstractModel
 from .._programs import in_any_lane
 from .._results import RESULTS
-from .._system import State
-from .._types import Count, Flag, Scalar
+from .._system import AbstractSystem, State
+from .._types import Args, Coordinates, Count, Flag, Scalar
 from ..schemes import AbstractScheme, AbstractSchemeWithMemory
 from .collocation import rates
-from .events import AbstractEvent, checked_events
+from .events import AbstractEvent, checked_events, Event, Impact
+from .impacts import Impacts, is_resting_number, resting_of, with_resting
 
 
 # A function counts as zero below this multiple of the round-off of its largest value.
@@ -38,8 +40,10 @@ class Watch(eqx.Module):
 
     - `side`: the sign that each function has before its next zero.
     - `values`: of all functions.
-    - `size`: the largest absolute value of each function so far.
-    - `slope`: the derivative by the time of a function that is zero; else 0.
+    - `sizes`: the largest absolute values so far, of the functions of the user in the first
+      row, and of the forces of closed gaps in the second.
+    - `is_force`: for which events the function is the force of a closed gap.
+    - `starts`: which functions are zero and move to their side.
     - `search`: the interval of lengths that encloses the first zero in the step.
     - `count`: the number of events so far.
     - `ended`: whether a terminal event has happened.
@@ -47,16 +51,24 @@ class Watch(eqx.Module):
 
     side: Float[Array, " events"]
     values: Float[Array, " events"]
-    size: Float[Array, " events"]
-    slope: Float[Array, " events"]
+    sizes: Float[Array, "2 events"]
+    is_force: Bool[Array, " events"]
+    starts: Bool[Array, " events"]
     search: "Search"
     count: Count
     ended: Flag
 
-    @property
-    def zero(self) -> Float[Array, " events"]:
-        """The round-off of each function."""
-        return _ZERO * jnp.finfo(self.size.dtype).eps * self.size
+    def sizes_with(self, values: Array, is_force: Array) -> Float[Array, "2 events"]:
+        """The sizes of all values so far and of these."""
+        size = jnp.where(jnp.isfinite(values), jnp.abs(values), 0.0)[None]
+        here = jnp.stack([~is_force, is_force])
+        return jnp.where(here, jnp.maximum(self.sizes, size), self.sizes)
+
+
+def _zero(sizes: Float[Array, "2 events"], is_force: Array) -> Float[Array, " events"]:
+    """The values below which a function counts as zero."""
+    size = jnp.where(is_force, sizes[1], sizes[0])
+    return _ZERO * jnp.finfo(size.dtype).eps * size
 
 
 class Search(eqx.Module):
@@ -137,15 +149,31 @@ class Found(eqx.Module):
 
 
 class Happening(eqx.Module):
-    """Which events happen at the end of a step, and the states before and after them."""
+    """Which events happen at the end of a step, the states before and after them, and
+    which gaps stay closed then."""
 
     happens: Bool[Array, " events"]
     before: State
     after: State
+    closed: Bool[Array, " events"]
+
+
+class Changed(eqx.Module):
+    """What events have made of a state and a model, the energy that they removed, and
+    whether all gaps open after impacts."""
+
+    state: State
+    varying: PyTree[Any]
+    lost: Scalar
+    resolved: Flag
 
 
 class Watcher(eqx.Module):
-    """The events of a run."""
+    """The events of a run.
+
+    The part of the model that events change is called `varying`: its inexact arrays if an
+    event changes `args`, or the numbers of the gaps that stay closed.
+    """
 
     events: tuple[AbstractEvent, ...]
     max_events: int = eqx.field(static=True)
@@ -155,40 +183,147 @@ class Watcher(eqx.Module):
         """A bound on the attempts that the searches of a run add to its steps."""
         return (_USUAL_TRIES + 1) * self.max_events + MAX_TRIES
 
+    @property
+    def impacts(self) -> Impacts:
+        return Impacts(tuple(x for x in self.events if isinstance(x, Impact)))
+
+    @property
+    def can_rest(self) -> bool:
+        return len(self.impacts.impacts) > 0 and self.impacts.can_rest
+
+    @property
+    def changes_args(self) -> bool:
+        return any(isinstance(x, Event) and x.reset_args for x in self.events)
+
+    @property
+    def changes_model(self) -> bool:
+        return self.can_rest or self.changes_args
+
+    @property
+    def changes_state(self) -> np.ndarray:
+        """Which events may change the state or the model."""
+        changes = [
+            x.reset is not None or x.reset_args is not None
+            if isinstance(x, Event)
+            else True
+            for x in self.events
+        ]
+        return np.asarray(changes)
+
+    @property
+    def _is_impact(self) -> np.ndarray:
+        return np.asarray([isinstance(x, Impact) for x in self.events])
+
+    def system(self, system: AbstractSystem, dtype: Any) -> AbstractSystem:
+        """The system of the run, with a constraint for each gap that may stay closed."""
+        return self.impacts.constrained(system, dtype) if self.can_rest else system
+
+    def varying(self, model: AbstractModel) -> PyTree[Any]:
+        """The part of a model that events change."""
+        if self.changes_args:
+            return eqx.filter(model, eqx.is_inexact_array)
+        return eqx.filter(model, is_resting_number(model))
+
+    def _of_events(self, of_gaps: Array) -> Array:
+        """Entries for all events, from those of the gaps; zeros for the others."""
+        out = jnp.zeros((len(self.events),), of_gaps.dtype)
+        return out.at[np.flatnonzero(self._is_impact)].set(of_gaps)
+
+    def closed(self, model: AbstractModel) -> Bool[Array, " events"]:
+        """Which events are impacts whose gaps stay closed."""
+        if not self.can_rest:
+            return jnp.zeros((len(self.events),), bool)
+        return self._of_events(resting_of(model) > 0)
+
+    def contact_forces(
+        self, model: AbstractModel, q: Coordinates, multipliers: Array
+    ) -> Float[Array, " events"]:
+        """The forces of closed gaps, from multipliers that are zero where gaps are open."""
+        if not self.can_rest:
+            return jnp.zeros((len(self.events),), multipliers.dtype)
+        all_closed = with_resting(model, jnp.ones_like(resting_of(model)))
+        forces = self.impacts.forces(all_closed, q, multipliers)
+        return self._of_events(forces)
+
     def values(
         self, model: AbstractModel, state: State, t: Scalar
     ) -> Float[Array, " events"]:
+        """The functions of all events; of a gap that stays closed this is its force."""
         user = model.to_user(state)
         values = [event.value(user, t, model.args) for event in self.events]
-        return jnp.stack(values).astype(state.q.dtype)
+        values = jnp.stack(values).astype(state.q.dtype)
+        if not self.can_rest:
+            return values
 
-    def begin(self, model: AbstractModel, state: State, t: Scalar) -> Watch:
+        def with_forces(values: Array) -> Array:
+            timed = State(state.q, state.v, t if model.system.is_timed else None)
+            _, multipliers = model.accelerations(timed)
+            forces = self.impacts.forces(model, state.q, multipliers)
+            forces = self._of_events(forces).astype(values.dtype)
+            return jnp.where(self.closed(model), forces, values)
+
+        any_closed = in_any_lane(jnp.any(self.closed(model)))
+        return jax.lax.cond(any_closed, with_forces, lambda values: values, values)
+
+    def begin(
+        self, model: AbstractModel, state: State, t: Scalar
+    ) -> tuple[Watch, PyTree[Any], RESULTS]:
+        """What is known at the start of a run, what varies of the model there, and a
+        failure if a gap is not open."""
+        model, opens = self._first_model(model, state, t)
+        closed = self.closed(model)
         values = jax.lax.stop_gradient(self.values(model, state, t))
         slope = jax.lax.stop_gradient(self._slopes(model, state, t))
-        size = jnp.abs(values)
+        none = jnp.zeros((2, values.size), values.dtype)
+        eps = jnp.finfo(values.dtype).eps
+        at_zero = ~closed & (jnp.abs(values) <= _ZERO * eps * jnp.abs(slope))
         watch = Watch(
-            side=_sign(values),
+            side=_sign(jnp.where(at_zero, slope, values)),
             values=values,
-            size=size,
-            slope=jnp.zeros_like(values),
+            sizes=none,
+            is_force=closed,
+            starts=at_zero & (slope != 0),
             search=no_search(values.dtype),
             count=jnp.array(0),
             ended=jnp.array(False),
         )
-        at_zero = size <= _ZERO * jnp.finfo(values.dtype).eps * jnp.abs(slope)
-        return eqx.tree_at(
-            lambda w: (w.side, w.slope),
-            watch,
-            (
-                jnp.where(at_zero, _sign(slope), watch.side),
-                jnp.where(at_zero, slope, 0.0),
-            ),
+        watch = eqx.tree_at(lambda w: w.sizes, watch, watch.sizes_with(values, closed))
+        # Forces push, and gaps are open or open now.
+        opens = opens & ~jnp.any(jnp.asarray(self._is_impact) & (watch.side < 0))
+        result = RESULTS.where(opens, RESULTS.successful, RESULTS.gap_closed_at_start)
+        return watch, self.varying(model) if self.changes_model else None, result
+
+    def _first_model(
+        self, model: AbstractModel, state: State, t: Scalar
+    ) -> tuple[AbstractModel, Flag]:
+        """The model at the start, in which gaps that are at rest and closed stay closed."""
+        if not self.can_rest:
+            return model, jnp.array(True)
+        impacts, inner = self.impacts, model.in_rates
+        start = inner_state(model, state, t)
+        gaps = impacts.gaps(start.q, model.args)
+        none = jnp.zeros_like(gaps)
+        inner = with_resting(inner, none)
+        rates = impacts.rates(inner, start)
+        # A gap is round-off beside the coordinates that it depends on.
+        _, size = jax.jvp(
+            lambda q: impacts.gaps(q, model.args), (start.q,), (jnp.abs(start.q),)
         )
+        acceleration, _ = impacts.motion(inner, start)
+        rounding = 1e3 * jnp.finfo(gaps.dtype).eps
+        touching = jnp.abs(gaps) <= rounding * jnp.maximum(jnp.abs(size), 1e-3)
+        still = jnp.abs(rates) <= rounding * (jnp.abs(acceleration) + jnp.abs(rates))
+        instant = rounding * jnp.ones((), gaps.dtype)
+        resting, ended = impacts.consistent(inner, start, none, touching & still, instant)
+        return with_resting(model, resting), ended
 
     def _slopes(
         self, model: AbstractModel, state: State, t: Scalar
     ) -> Float[Array, " events"]:
-        """The derivatives of all functions by the time, in a motion through this state."""
+        """The derivatives of all functions by the time, in a motion through this state.
+
+        They are those of the functions of the user, also where gaps are closed.
+        """
         in_rates = model.to_rates(state)
         qdot, vdot = rates(model.in_rates, in_rates)
 
@@ -205,12 +340,11 @@ class Watcher(eqx.Module):
         """What happens in a step of this length, from `place`."""
         values_now = jax.lax.stop_gradient(values)
         length, place = jax.lax.stop_gradient((length, place))
-        search = watch.search
-        sized = eqx.tree_at(lambda w: w.size, watch, self._size(watch, values_now))
-        zero, left = sized.zero, watch.side * values_now
+        search, starts = watch.search, watch.starts
+        zero = _zero(watch.sizes_with(values_now, watch.is_force), watch.is_force)
+        left = watch.side * values_now
         armed = self._armed(watch)
         # A function that is zero at the start must first become positive.
-        starts = watch.slope != 0
         least = jnp.where(starts & ~search.active, -zero, zero)
         distance = jnp.min(jnp.where(armed, left, jnp.inf))
         beyond = jnp.any(armed & (left <= jnp.where(starts, -zero, 0)))
@@ -245,16 +379,11 @@ class Watcher(eqx.Module):
         )
         return (direction == 0) | (watch.side == -direction)
 
-    def _size(self, watch: Watch, values: Array) -> Array:
-        return jnp.where(
-            jnp.isfinite(values), jnp.maximum(watch.size, abs(values)), watch.size
-        )
-
     def _first_interval(
         self, watch: Watch, length: Scalar, distance: Scalar, armed: Array
     ) -> Search:
         left = jnp.where(armed, watch.side * watch.values, jnp.inf)
-        at_zero = watch.slope[jnp.argmin(left)] != 0
+        at_zero = watch.starts[jnp.argmin(left)]
         return Search(
             active=jnp.array(True),
             lower=jnp.zeros_like(length),
@@ -266,66 +395,124 @@ class Watcher(eqx.Module):
         )
 
     def after(
-        self, model: AbstractModel, state: State, t: Scalar, happens: Array
-    ) -> tuple[State, Scalar]:
-        """The state after all events that happen, and the energy that they removed.
+        self,
+        model: AbstractModel,
+        state: State,
+        t: Scalar,
+        happens: Array,
+        h: Scalar,
+        remade: Callable[[State, Args], AbstractModel],
+    ) -> Changed:
+        """What all events that happen have made of a state and a model.
 
-        The states are those of the model. Events that happen at once do so in their order.
+        Resets come first, in their order, then impacts. `remade(state, args)` is the model
+        with other `args`, and `h` the usual length of a step.
         """
+        varying = self.varying(model) if self.changes_model else None
+        zero, yes = jnp.zeros((), state.q.dtype), jnp.array(True)
+        if not self.changes_state.any():
+            return Changed(state, varying, zero, yes)
 
-        def change(state: State) -> tuple[State, Scalar]:
-            inner, before = model.in_rates, model.to_rates(state)
-            after = before
-            for k, event in enumerate(self.events):
-                if event.changes_state:
-                    new = event.after(inner, after, t)
-                    after = jax.tree.map(
-                        lambda x, y, k=k: jnp.where(happens[k], x, y), new, after
-                    )
-            energy = lambda state: inner.kinetic(state) + inner.potential(state)
-            user = inner.to_user(after)
-            new = model.to_internal(State(user.q, user.v, state.t))
+        def change(state: State) -> Changed:
+            before = inner_state(model, state, t)
+            changed, after = self._reset(model, before, t, happens, remade)
+            after, changed, resolved = self._hit(changed, after, happens, h)
+            energy = lambda model, x: (
+                model.in_rates.kinetic(x) + model.in_rates.potential(x)
+            )
+            user = changed.in_rates.to_user(after)
+            new = changed.to_internal(State(user.q, user.v, state.t))
             same = ~jnp.any(happens)
-            new = jax.tree.map(lambda x, y: jnp.where(same, x, y), state, new)
-            return new, jnp.where(same, 0.0, energy(before) - energy(after))
+            keep = lambda x, y: jnp.where(same, x, y)
+            lost = energy(model, before) - energy(changed, after)
+            new_varying = self.varying(changed) if self.changes_model else None
+            return Changed(
+                jax.tree.map(keep, state, new),
+                jax.tree.map(keep, varying, new_varying),
+                keep(zero, lost),
+                same | resolved,
+            )
 
-        none = lambda state: (state, jnp.zeros((), state.q.dtype))
-        changes = [event.changes_state for event in self.events]
-        if not any(changes):
-            return none(state)
-        changed = jnp.any(happens & jnp.asarray(changes))
+        none = lambda state: Changed(state, varying, zero, yes)
+        changed = jnp.any(happens & jnp.asarray(self.changes_state))
         return jax.lax.cond(in_any_lane(changed), change, none, state)
+
+    def _reset(
+        self,
+        model: AbstractModel,
+        state: State,
+        t: Scalar,
+        happens: Array,
+        remade: Callable[[State, Args], AbstractModel],
+    ) -> tuple[AbstractModel, State]:
+        """The model and its state, in rates, after the resets of all `Event`s."""
+        user, args = model.in_rates.to_user(state), model.args
+        choose = lambda k: lambda x, y: jnp.where(happens[k], x, y)
+        for k, event in enumerate(self.events):
+            if isinstance(event, Event):
+                new_args = event.args_after(user, t, args)
+                new = event.state_after(user, t, args)
+                user = jax.tree.map(choose(k), new, user)
+                args = jax.tree.map(choose(k), new_args, args)
+        if self.changes_args:
+            varying = eqx.filter(remade(user, args), eqx.is_inexact_array)
+            model = eqx.combine(varying, model)
+        after = inner_state(model, model.to_internal(State(user.q, user.v, state.t)), t)
+        return model, after
+
+    def _hit(
+        self, model: AbstractModel, state: State, happens: Array, h: Scalar
+    ) -> tuple[State, AbstractModel, Flag]:
+        """The state, in rates, and the model after all impacts."""
+        if not self._is_impact.any():
+            return state, model, jnp.array(True)
+        numbers = np.flatnonzero(self._is_impact)
+        hits = self.impacts.after(model.in_rates, state, happens[numbers], h)
+        if hits.resting is not None:
+            model = with_resting(model, hits.resting)
+        return hits.state, model, hits.resolved
 
     def watch_after(
         self, watch: Watch, model: AbstractModel, state: State, t: Scalar, happens: Array
     ) -> Watch:
         """What is known at the start of the next step, after an accepted one."""
         values = jax.lax.stop_gradient(self.values(model, state, t))
-        size = self._size(watch, values)
-        sized = eqx.tree_at(lambda w: w.size, watch, size)
-        is_zero = jnp.abs(values) <= sized.zero
+        closed = self.closed(model)
+        sizes = watch.sizes_with(values, closed)
+        is_zero = jnp.abs(values) <= _zero(sizes, closed)
         side = jnp.where(
             is_zero, jnp.where(happens, -watch.side, watch.side), _sign(values)
         )
-        slope = jnp.zeros_like(values)
-        changes = np.asarray([event.changes_state for event in self.events])
-        if changes.any():
-            turned = happens & changes
+        starts = jnp.zeros_like(happens)
+        if self.changes_state.any():
+            turned = happens & self.changes_state
             of_change = lambda: jax.lax.stop_gradient(self._slopes(model, state, t))
-            slopes = jax.lax.cond(in_any_lane(jnp.any(turned)), of_change, lambda: slope)
-            known = turned & is_zero & (slopes != 0)
-            side = jnp.where(known, _sign(slopes), side)
-            slope = jnp.where(known, slopes, 0.0)
+            slopes = jax.lax.cond(
+                in_any_lane(jnp.any(turned)), of_change, lambda: jnp.zeros_like(values)
+            )
+            starts = turned & is_zero & (slopes != 0)
+            side = jnp.where(starts, _sign(slopes), side)
+            # A gap that has been released opens, though it may have no rate yet.
+            released = watch.is_force & ~closed
+            starts = (starts | (released & is_zero)) & ~closed
+            side = jnp.where(released | closed, 1.0, side)
         terminal = jnp.asarray([event.terminal for event in self.events])
         return Watch(
             side=side,
             values=values,
-            size=size,
-            slope=slope,
+            sizes=sizes,
+            is_force=closed,
+            starts=starts,
             search=no_search(values.dtype),
             count=watch.count + jnp.any(happens).astype(watch.count.dtype),
             ended=watch.ended | jnp.any(happens & terminal),
         )
+
+
+def inner_state(model: AbstractModel, state: State, t: Scalar) -> State:
+    """The state in rates, with its time if the system depends on it."""
+    timed = State(state.q, state.v, t if model.system.is_timed else None)
+    return model.to_rates(timed)
 
 
 def _sign(x: Array) -> Array:

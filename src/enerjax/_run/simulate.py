@@ -172,9 +172,7 @@ def _run(task: Task) -> tuple[Solution, Scalar]:
     plan, saving, stepper = task.plan, task.saving, task.stepper()
     model = stepper.model
     start = model.to_internal(task.start)
-    begin, end, record = run_loop(
-        stepper, start, saving.steps_in_group(plan), task.keep(model)
-    )
+    begin, end, record = run_loop(stepper, start, saving.steps_in_group(plan), task.keep)
     run = RecordedRun(
         model=model.in_rates,
         plan=plan,
@@ -183,8 +181,9 @@ def _run(task: Task) -> tuple[Solution, Scalar]:
         completed=end.completed,
         order=task.scheme.order,
     )
-    solution = task.solution(model, saving.rows(run), end)
+    rows = saving.rows(run)
+    solution = task.solution(model, rows, end)
     if task.watcher is not None:
-        happened = task.events(model, record)
+        happened = task.events(model, record, rows.multipliers)
         solution = dataclasses.replace(solution, events=happened)
     return solution, plan.time(end.place)
