@@ -68,6 +68,7 @@ from ._tools.measure import (
 from ._tools.sweep import Sweep as Sweep, sweep as sweep
 from .scenes import (
     bodies as bodies,
+    contacts as contacts,
     drives as drives,
     forces as forces,
     Gap as Gap,

@@ -364,12 +364,15 @@ class Watcher(eqx.Module):
             lambda x, y: jnp.where(searches, x, y), following, no_search(length.dtype)
         )
         failed = searches & (following.tries > MAX_TRIES)
+        result = RESULTS.where(failed, RESULTS.event_not_found, RESULTS.successful)
+        closes = jnp.any(jnp.asarray(self._is_impact) & (watch.side < 0))
+        result = RESULTS.where(closes, RESULTS.impacts_unresolved, result)
         return Found(
             happens=found & near,
             searches=searches,
             search=following,
             values=values,
-            result=RESULTS.where(failed, RESULTS.event_not_found, RESULTS.successful),
+            result=result,
         )
 
     def _armed(self, watch: Watch) -> Bool[Array, " events"]:
@@ -573,10 +576,16 @@ def _without_none(tangents: Any, values: Any) -> Any:
 
 
 def watcher_of(
-    events: Any, max_events: Any, scheme: AbstractScheme, is_long: bool
+    system: AbstractSystem,
+    events: Any,
+    max_events: Any,
+    scheme: AbstractScheme,
+    is_long: bool,
 ) -> Watcher | None:
-    """The checked events of a run; `None` if there are none."""
-    checked, bound = checked_events(events, max_events)
+    """The checked events of a run, those of the system first; `None` if there are none."""
+    of_system, _ = checked_events(system.events, max_events)
+    of_run, bound = checked_events(events, max_events)
+    checked = (*of_system, *of_run)
     if not checked:
         return None
     if isinstance(scheme.stage, AbstractSchemeWithMemory):

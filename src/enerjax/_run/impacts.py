@@ -210,8 +210,11 @@ class Impacts(eqx.Module):
         number = len(self.impacts)
         order = jnp.tile(jnp.arange(number), 1 if number == 1 else _SWEEPS)
         (v, resting), _ = jax.lax.scan(hit, (state.v, resting), order)
-        rounding = 1e3 * jnp.finfo(q.dtype).eps * jnp.max(jnp.abs(rates(state.v)))
-        resolved = ~jnp.any(happens & (rates(v) < -rounding))
+        eps = jnp.finfo(q.dtype).eps
+        # Hits without rebound in turn halve the rates, which are then set to zero.
+        least = 1e3 * eps if resting is None else eps**0.5
+        closing = rates(v) < -least * jnp.max(jnp.abs(rates(state.v)))
+        resolved = ~jnp.any(happens & closing)
         return State(q, v, state.t), resting, resolved
 
     def consistent(

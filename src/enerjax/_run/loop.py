@@ -208,11 +208,12 @@ def attempt_with_events(
         result=first_failure(verdict.result, failure),
         memory=_after_event(stepper, later, before, verdict, changed.state, place, happens),
     )
+    without_time = lambda state: State(state.q, state.v)
     happening = Happening(
-        happens,
-        model.to_rates(out.state),
-        later.to_rates(changed.state),
-        watcher.closed(later),
+        happens=happens,
+        before=without_time(model.to_rates(out.state)),
+        after=without_time(later.to_rates(changed.state)),
+        closed=watcher.closed(later),
     )
     energies = eqx.tree_at(
         lambda x: x.impact, out.energies, changed.lost, is_leaf=lambda x: x is None

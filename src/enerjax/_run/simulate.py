@@ -85,9 +85,10 @@ def simulate(
       `stats.halvings` shows where steps were divided.
     - `events`: an `Event`, an `Impact`, or a list of them: zeros of functions of the state,
       at which a step ends exactly, and after which the state may be another one. They are
-      listed in `Solution.events`. Every event is found that changes the sign of its
-      function between the ends of a step; a function that does so twice within a step
-      is not seen, unless it is zero at the start after a change of the state.
+      listed in `Solution.events`, after those of the system. Every event is found that
+      changes the sign of its function between the ends of a step; a function that does so
+      twice within a step is not seen, unless it is zero at the start after a change of the
+      state.
     - `max_events`: the number of times at which events may happen; a run that needs more
       fails.
     - `progress`: `True` for a line on stderr that shows how far the run is, or a function
@@ -128,7 +129,7 @@ def simulate(
     plan = controller.plan(scheme, step, begin, end)
     longest = plan.max_attempts if options is None else sys.maxsize
     saving = saving_of(saveat, plan, controller, longest)
-    watcher = watcher_of(events, max_events, scheme, options is not None)
+    watcher = watcher_of(system, events, max_events, scheme, options is not None)
     if watcher is not None:
         saving = with_events(saving, plan)
         plan = plan.with_events(watcher.max_attempts)
