@@ -3,6 +3,9 @@
 After each attempted step the functions of all events are evaluated. If one has passed a
 zero, the step is repeated with lengths that enclose the first zero, by the Illinois form of
 regula falsi, until the function is round-off at the end of the step.
+
+A function can also pass zero twice within a step. If a motion interpolated between the ends
+of the step does so, the step is repeated up to the extremum between these zeros.
 """
 
 from collections.abc import Callable
@@ -80,6 +83,8 @@ class Search(eqx.Module):
       those of an end that has been kept are halved.
     - `moved`: 1 if the last attempt has moved the upper end, -1 the lower end, 0 none.
     - `tries`: the number of attempts.
+    - `probes`: whether the step to the upper end is tried next, because a function may pass
+      zero twice.
     """
 
     active: Flag
@@ -89,6 +94,7 @@ class Search(eqx.Module):
     at_upper: Scalar
     moved: Scalar
     tries: Count
+    probes: Flag
 
     @property
     def length(self) -> Scalar:
@@ -98,6 +104,7 @@ class Search(eqx.Module):
         # Where the function vanishes at the lower end too, the secant finds this zero.
         part = jnp.where(self.at_lower > 0, part, 0.5)
         margin = jnp.where(self.tries > MAX_TRIES // 2, 0.5, 0.0)
+        part = jnp.where(self.probes, 1.0, part)
         return self.lower + jnp.clip(part, margin, 1 - margin) * width
 
     def narrowed(self, length: Scalar, distance: Scalar, beyond: Flag) -> "Search":
@@ -115,6 +122,7 @@ class Search(eqx.Module):
             at_upper=jnp.where(beyond, distance, at_upper),
             moved=moved,
             tries=self.tries + 1,
+            probes=jnp.array(False),
         )
 
 
@@ -128,6 +136,7 @@ def no_search(dtype: Any) -> Search:
         at_upper=-one,
         moved=zero,
         tries=jnp.array(0),
+        probes=jnp.array(False),
     )
 
 
@@ -336,7 +345,57 @@ class Watcher(eqx.Module):
         at, along = (in_rates.q, in_rates.v, t), (qdot, vdot, jnp.ones_like(t))
         return jax.jvp(values, at, along)[1]
 
-    def find(self, watch: Watch, values: Array, length: Scalar, place: Scalar) -> Found:
+    def extremum(
+        self,
+        model: AbstractModel,
+        ends: tuple[State, State],
+        times: tuple[Scalar, Scalar],
+        watch: Watch,
+        values: Array,
+    ) -> tuple[Scalar, Flag]:
+        """The fraction of a step at the first extremum of a function that has passed zero
+        before it and passes zero again after it, and whether there is one.
+
+        `ends` are the states of a step, without derivatives. Functions that have one sign
+        at both ends are evaluated along a motion between them, first in the middle and then
+        at the vertex of the parabola through three values.
+        """
+        between = _motion_between(model, ends, times)
+        middle = self._values_at(model, between, 0.5)
+        side = jnp.where(watch.values < 0, -1.0, 1.0).astype(values.dtype)
+        first, half, last = side * watch.values, side * middle, side * values
+        bend, slope = 2 * (first - 2 * half + last), 4 * half - 3 * first - last
+        vertex = -slope / (2 * jnp.where(bend > 0, bend, 1.0))
+        inside = (bend > 0) & (vertex > 0) & (vertex < 1)
+        vertex = jnp.where(inside, vertex, 0.5)
+        lowest = [
+            event.value(*between(vertex[k]), model.args).astype(values.dtype)
+            for k, event in enumerate(self.events)
+        ]
+        zero = _zero(watch.sizes_with(values, watch.is_force), watch.is_force)
+        passes = (first > zero) & (last > zero) & (side * jnp.stack(lowest) < -zero)
+        passes = passes & ~watch.is_force
+        part = jnp.min(jnp.where(passes, vertex, 1.0))
+        return part, jnp.any(passes)
+
+    def _values_at(
+        self,
+        model: AbstractModel,
+        motion: Callable[[Any], tuple[State, Scalar]],
+        part: float,
+    ) -> Float[Array, " events"]:
+        state, t = motion(part)
+        values = [event.value(state, t, model.args) for event in self.events]
+        return jnp.stack(values).astype(state.q.dtype)
+
+    def find(
+        self,
+        watch: Watch,
+        values: Array,
+        length: Scalar,
+        place: Scalar,
+        extremum: tuple[Scalar, Flag],
+    ) -> Found:
         """What happens in a step of this length, from `place`."""
         values_now = jax.lax.stop_gradient(values)
         length, place = jax.lax.stop_gradient((length, place))
@@ -356,10 +415,18 @@ class Watcher(eqx.Module):
             narrowed.upper - narrowed.lower <= 4 * eps * (place + length)
         )
         found = jnp.any(near) & (first | (is_narrow & beyond))
-        searches = ~found & (search.active | beyond)
+        part, passes_twice = extremum
+        probes = passes_twice & ~beyond & ~search.active
+        # A step that only leads to an extremum is a step as any other.
+        narrows = search.active & ~search.probes
+        searches = ~found & (narrows | beyond | probes)
         start = self._first_interval(watch, length, distance, armed)
-        use = lambda x, y: jnp.where(search.active, x, y)
-        following = jax.tree.map(use, narrowed, start)
+        probe = eqx.tree_at(
+            lambda x: (x.upper, x.probes), start, (part * length, jnp.array(True))
+        )
+        use = lambda flag: lambda x, y: jnp.where(flag, x, y)
+        following = jax.tree.map(use(probes), probe, start)
+        following = jax.tree.map(use(narrows), narrowed, following)
         following = jax.tree.map(
             lambda x, y: jnp.where(searches, x, y), following, no_search(length.dtype)
         )
@@ -395,6 +462,7 @@ class Watcher(eqx.Module):
             at_upper=jnp.minimum(distance, 0),
             moved=jnp.zeros_like(length),
             tries=jnp.array(1),
+            probes=jnp.array(False),
         )
 
     def after(
@@ -482,23 +550,18 @@ class Watcher(eqx.Module):
         values = jax.lax.stop_gradient(self.values(model, state, t))
         closed = self.closed(model)
         sizes = watch.sizes_with(values, closed)
-        is_zero = jnp.abs(values) <= _zero(sizes, closed)
-        side = jnp.where(
-            is_zero, jnp.where(happens, -watch.side, watch.side), _sign(values)
+        is_zero = ~closed & (jnp.abs(values) <= _zero(sizes, closed))
+        # From a zero a function moves to the side of its slope.
+        of_motion = lambda: jax.lax.stop_gradient(self._slopes(model, state, t))
+        slopes = jax.lax.cond(
+            in_any_lane(jnp.any(is_zero)), of_motion, lambda: jnp.zeros_like(values)
         )
-        starts = jnp.zeros_like(happens)
-        if self.changes_state.any():
-            turned = happens & self.changes_state
-            of_change = lambda: jax.lax.stop_gradient(self._slopes(model, state, t))
-            slopes = jax.lax.cond(
-                in_any_lane(jnp.any(turned)), of_change, lambda: jnp.zeros_like(values)
-            )
-            starts = turned & is_zero & (slopes != 0)
-            side = jnp.where(starts, _sign(slopes), side)
-            # A gap that has been released opens, though it may have no rate yet.
-            released = watch.is_force & ~closed
-            starts = (starts | (released & is_zero)) & ~closed
-            side = jnp.where(released | closed, 1.0, side)
+        starts = is_zero & (slopes != 0)
+        side = jnp.where(starts, _sign(slopes), _sign(values))
+        # A gap that has been released opens, though it may have no rate yet.
+        released = watch.is_force & ~closed
+        starts = starts | (released & is_zero)
+        side = jnp.where(released | closed, 1.0, side)
         terminal = jnp.asarray([event.terminal for event in self.events])
         return Watch(
             side=side,
@@ -516,6 +579,27 @@ def inner_state(model: AbstractModel, state: State, t: Scalar) -> State:
     """The state in rates, with its time if the system depends on it."""
     timed = State(state.q, state.v, t if model.system.is_timed else None)
     return model.to_rates(timed)
+
+
+def _motion_between(
+    model: AbstractModel, ends: tuple[State, State], times: tuple[Scalar, Scalar]
+) -> Callable[[Any], tuple[State, Scalar]]:
+    """The user's state and the time at a fraction of a step: cubic in the coordinates,
+    linear in the velocities."""
+    inner, (t0, t1) = model.in_rates, times
+    a, b = (model.to_rates(State(x.q, x.v)) for x in ends)
+    h = t1 - t0
+    of_a, of_b = (h * inner.lift(x.q, x.v) for x in (a, b))
+    step = b.q - a.q
+
+    def at(part: Any) -> tuple[State, Scalar]:
+        rest = 1 - part
+        bow = rest * (of_a - step) - part * (of_b - step)
+        q = a.q + part * step + part * rest * bow
+        v = a.v + part * (b.v - a.v)
+        return inner.to_user(State(q, v)), t0 + part * h
+
+    return at
 
 
 def _sign(x: Array) -> Array:

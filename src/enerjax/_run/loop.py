@@ -170,10 +170,14 @@ class _AttemptWithEvents(eqx.Module):
         before, plan, model = self.before, self.stepper.plan, self.stepper.model
         begin = with_time(model, plan, before.state, before.place)
         out = self.stepper.advance(before, begin, self.length, self.live)
-        assert before.watch is not None
-        end = plan.t0 + plan.unit * (before.place + self.length)
-        values = self.watcher.values(model, out.state, end)
-        found = self.watcher.find(before.watch, values, self.length, before.place)
+        watch = before.watch
+        assert watch is not None
+        times = plan.time(before.place), plan.t0 + plan.unit * (before.place + self.length)
+        values = self.watcher.values(model, out.state, times[1])
+        constant = jax.lax.stop_gradient((begin, out.state)), jax.lax.stop_gradient(times)
+        now = jax.lax.stop_gradient(values)
+        extremum = self.watcher.extremum(model, *constant, watch, now)
+        found = self.watcher.find(watch, values, self.length, before.place, extremum)
         return out, found
 
 

@@ -85,10 +85,10 @@ def simulate(
       `stats.halvings` shows where steps were divided.
     - `events`: an `Event`, an `Impact`, or a list of them: zeros of functions of the state,
       at which a step ends exactly, and after which the state may be another one. They are
-      listed in `Solution.events`, after those of the system. Every event is found that
-      changes the sign of its function between the ends of a step; a function that does so
-      twice within a step is not seen, unless it is zero at the start after a change of the
-      state.
+      listed in `Solution.events`, after those of the system. Every zero is found at
+      which a function changes its sign between the ends of a step, and two zeros within a
+      step if the function is as smooth as the motion: if between the zeros it exceeds the
+      error of a cubic interpolation of the step.
     - `max_events`: the number of times at which events may happen; a run that needs more
       fails.
     - `progress`: `True` for a line on stderr that shows how far the run is, or a function
