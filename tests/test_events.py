@@ -320,7 +320,7 @@ def test_all_zeros_of_a_hundred_random_functions_are_found():
 
         values = exact(times)
         changes = np.flatnonzero(np.sign(values[1:]) != np.sign(values[:-1]))
-        zeros = [brentq(exact, times[j], times[j + 1], xtol=1e-15) for j in changes]
+        zeros: Any = [brentq(exact, *times[j : j + 2], xtol=1e-15) for j in changes]
         found = sol.events.ts[k][: sol.events.count[k]]
         np.testing.assert_allclose(found, zeros, atol=1e-12, err_msg=str(k))  # round-off
         rising = sol.events.happened[k][: len(zeros), 1]

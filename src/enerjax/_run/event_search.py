@@ -393,12 +393,11 @@ class Watcher(eqx.Module):
         watch: Watch,
         values: Array,
         length: Scalar,
-        place: Scalar,
         extremum: tuple[Scalar, Flag],
     ) -> Found:
-        """What happens in a step of this length, from `place`."""
+        """What happens in a step of this length."""
         values_now = jax.lax.stop_gradient(values)
-        length, place = jax.lax.stop_gradient((length, place))
+        length = jax.lax.stop_gradient(length)
         search, starts = watch.search, watch.starts
         zero = _zero(watch.sizes_with(values_now, watch.is_force), watch.is_force)
         left = watch.side * values_now
@@ -411,9 +410,7 @@ class Watcher(eqx.Module):
         first = jnp.all(~armed | (left >= -zero))
         narrowed = search.narrowed(length, distance, beyond)
         eps = jnp.finfo(length.dtype).eps
-        is_narrow = search.active & (
-            narrowed.upper - narrowed.lower <= 4 * eps * (place + length)
-        )
+        is_narrow = search.active & (narrowed.upper - narrowed.lower <= 4 * eps * length)
         found = jnp.any(near) & (first | (is_narrow & beyond))
         part, passes_twice = extremum
         probes = passes_twice & ~beyond & ~search.active
@@ -550,7 +547,7 @@ class Watcher(eqx.Module):
         values = jax.lax.stop_gradient(self.values(model, state, t))
         closed = self.closed(model)
         sizes = watch.sizes_with(values, closed)
-        is_zero = ~closed & (jnp.abs(values) <= _zero(sizes, closed))
+        is_zero = ~closed & (happens | (jnp.abs(values) <= _zero(sizes, closed)))
         # From a zero a function moves to the side of its slope.
         of_motion = lambda: jax.lax.stop_gradient(self._slopes(model, state, t))
         slopes = jax.lax.cond(

@@ -177,7 +177,7 @@ class _AttemptWithEvents(eqx.Module):
         constant = jax.lax.stop_gradient((begin, out.state)), jax.lax.stop_gradient(times)
         now = jax.lax.stop_gradient(values)
         extremum = self.watcher.extremum(model, *constant, watch, now)
-        found = self.watcher.find(watch, values, self.length, before.place, extremum)
+        found = self.watcher.find(watch, values, self.length, extremum)
         return out, found
 
 

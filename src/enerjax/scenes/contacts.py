@@ -48,20 +48,16 @@ class Penalty(eqx.Module):
 class AbstractContact(AbstractPart):
     """A contact of a scene: a gap between two bodies and the law of its closing."""
 
-    law: eqx.AbstractVar[Restitution | Penalty]
-
-    def __check_init__(self):
-        if not isinstance(self.law, Restitution | Penalty):
-            raise TypeError(
-                f"The `law` of '{self.name}' must be `ej.contacts.Restitution(...)` or "
-                f"`ej.contacts.Penalty(...)`, got {self.law!r}."
-            )
-
 
 def _resolved(
     ends: Ends, law: Restitution | Penalty, gap: AbstractMeasure, numbers: Numbers
 ) -> tuple[AbstractLaw, Numbers]:
     """The law of a contact with this gap, and all of its numbers."""
+    if not isinstance(law, Restitution | Penalty):
+        raise TypeError(
+            f"The `law` of {ends.part} must be `ej.contacts.Restitution(...)` or "
+            f"`ej.contacts.Penalty(...)`, got {law!r}."
+        )
     if isinstance(law, Restitution):
         if law.coefficient is None:
             return Gap(gap, is_elastic=True), numbers
