@@ -368,13 +368,21 @@ class Watcher(eqx.Module):
         vertex = -slope / (2 * jnp.where(bend > 0, bend, 1.0))
         inside = (bend > 0) & (vertex > 0) & (vertex < 1)
         vertex = jnp.where(inside, vertex, 0.5)
-        lowest = [
-            event.value(*between(vertex[k]), model.args).astype(values.dtype)
-            for k, event in enumerate(self.events)
-        ]
         zero = _zero(watch.sizes_with(values, watch.is_force), watch.is_force)
-        passes = (first > zero) & (last > zero) & (side * jnp.stack(lowest) < -zero)
-        passes = passes & ~watch.is_force
+        same_sign = (first > zero) & (last > zero) & ~watch.is_force
+        depth = jnp.where(inside, first - bend * vertex**2, half)
+
+        def lowest() -> Float[Array, " events"]:
+            found = [
+                event.value(*between(vertex[k]), model.args).astype(values.dtype)
+                for k, event in enumerate(self.events)
+            ]
+            return side * jnp.stack(found)
+
+        # The parabola is far from zero in most steps.
+        is_near = jnp.any(same_sign & (depth < 0.5 * jnp.minimum(first, last)))
+        least = jax.lax.cond(in_any_lane(is_near), lowest, lambda: first)
+        passes = same_sign & (least < -zero)
         part = jnp.min(jnp.where(passes, vertex, 1.0))
         return part, jnp.any(passes)
 
@@ -541,10 +549,25 @@ class Watcher(eqx.Module):
         return hits.state, model, hits.resolved
 
     def watch_after(
-        self, watch: Watch, model: AbstractModel, state: State, t: Scalar, happens: Array
+        self,
+        watch: Watch,
+        model: AbstractModel,
+        state: State,
+        t: Scalar,
+        happens: Array,
+        values: Float[Array, " events"],
     ) -> Watch:
-        """What is known at the start of the next step, after an accepted one."""
-        values = jax.lax.stop_gradient(self.values(model, state, t))
+        """What is known at the start of the next step, after an accepted one.
+
+        `values` are the functions at its end, before the events.
+        """
+        if self.changes_state.any():
+            values = jax.lax.cond(
+                in_any_lane(jnp.any(happens)),
+                lambda: self.values(model, state, t),
+                lambda: values,
+            )
+        values = jax.lax.stop_gradient(values)
         closed = self.closed(model)
         sizes = watch.sizes_with(values, closed)
         is_zero = ~closed & (happens | (jnp.abs(values) <= _zero(sizes, closed)))

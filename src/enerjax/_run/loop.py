@@ -227,7 +227,7 @@ def attempt_with_events(
     search = select(found.searches & live, found.search, no_search(length.dtype))
     waiting = eqx.tree_at(lambda x: x.search, watch, search)
     timed = with_time(later, plan, changed.state, place)
-    moved = watcher.watch_after(watch, later, timed, t, happens)
+    moved = watcher.watch_after(watch, later, timed, t, happens, found.values)
     good = live & verdict.accepted
     after = eqx.tree_at(
         lambda x: (x.watch, x.varying),
