@@ -23,13 +23,14 @@ from .._results import RESULTS
 from .._system import AbstractSystem, State
 from .._types import Args, Coordinates, Count, Flag, Scalar
 from ..schemes import AbstractScheme, AbstractSchemeWithMemory
-from .collocation import rates
 from .events import AbstractEvent, checked_events, Event, Impact
 from .impacts import Impacts, is_resting_number, resting_of, with_resting
 
 
 # A function counts as zero below this multiple of the round-off of its largest value.
 _ZERO = 64.0
+# The same for the force of a closed gap, which has the error of a linear solve.
+_ZERO_FORCE = 1e4
 # The attempts of one search. Ten usually suffice; steps that are halved forty times, for a
 # function that touches zero at their start, need more.
 MAX_TRIES = 80
@@ -70,8 +71,8 @@ class Watch(eqx.Module):
 
 def _zero(sizes: Float[Array, "2 events"], is_force: Array) -> Float[Array, " events"]:
     """The values below which a function counts as zero."""
-    size = jnp.where(is_force, sizes[1], sizes[0])
-    return _ZERO * jnp.finfo(size.dtype).eps * size
+    size = jnp.where(is_force, _ZERO_FORCE * sizes[1], _ZERO * sizes[0])
+    return jnp.finfo(size.dtype).eps * size
 
 
 class Search(eqx.Module):
@@ -103,7 +104,7 @@ class Search(eqx.Module):
         part = self.at_lower / (self.at_lower - self.at_upper)
         # Where the function vanishes at the lower end too, the secant finds this zero.
         part = jnp.where(self.at_lower > 0, part, 0.5)
-        margin = jnp.where(self.tries > MAX_TRIES // 2, 0.5, 0.0)
+        margin = jnp.where(self.tries > MAX_TRIES // 4, 0.5, 0.0)
         part = jnp.where(self.probes, 1.0, part)
         return self.lower + jnp.clip(part, margin, 1 - margin) * width
 
@@ -168,11 +169,12 @@ class Happening(eqx.Module):
 
 
 class Changed(eqx.Module):
-    """What events have made of a state and a model, the energy that they removed, and
-    whether all gaps open after impacts."""
+    """What events have made of a state and a model, the forces of closed gaps, the energy
+    that was removed, and whether all gaps open after impacts."""
 
     state: State
     varying: PyTree[Any]
+    forces: Float[Array, " events"]
     lost: Scalar
     resolved: Flag
 
@@ -258,9 +260,7 @@ class Watcher(eqx.Module):
         self, model: AbstractModel, state: State, t: Scalar
     ) -> Float[Array, " events"]:
         """The functions of all events; of a gap that stays closed this is its force."""
-        user = model.to_user(state)
-        values = [event.value(user, t, model.args) for event in self.events]
-        values = jnp.stack(values).astype(state.q.dtype)
+        values = self._of_user(model, state, t)
         if not self.can_rest:
             return values
 
@@ -274,14 +274,23 @@ class Watcher(eqx.Module):
         any_closed = in_any_lane(jnp.any(self.closed(model)))
         return jax.lax.cond(any_closed, with_forces, lambda values: values, values)
 
+    def _of_user(
+        self, model: AbstractModel, state: State, t: Scalar
+    ) -> Float[Array, " events"]:
+        """The functions of all events, also where gaps are closed."""
+        user = model.to_user(state)
+        values = [event.value(user, t, model.args) for event in self.events]
+        return jnp.stack(values).astype(state.q.dtype)
+
     def begin(
         self, model: AbstractModel, state: State, t: Scalar
     ) -> tuple[Watch, PyTree[Any], RESULTS]:
         """What is known at the start of a run, what varies of the model there, and a
         failure if a gap is not open."""
-        model, opens = self._first_model(model, state, t)
+        model, forces, opens = self._first_model(model, state, t)
         closed = self.closed(model)
-        values = jax.lax.stop_gradient(self.values(model, state, t))
+        values = jnp.where(closed, forces, self._of_user(model, state, t))
+        values = jax.lax.stop_gradient(values)
         slope = jax.lax.stop_gradient(self._slopes(model, state, t))
         none = jnp.zeros((2, values.size), values.dtype)
         eps = jnp.finfo(values.dtype).eps
@@ -304,27 +313,26 @@ class Watcher(eqx.Module):
 
     def _first_model(
         self, model: AbstractModel, state: State, t: Scalar
-    ) -> tuple[AbstractModel, Flag]:
-        """The model at the start, in which gaps that are at rest and closed stay closed."""
+    ) -> tuple[AbstractModel, Float[Array, " events"], Flag]:
+        """The model at the start, in which gaps that are closed and at rest stay closed,
+        their forces, and whether they could be found."""
         if not self.can_rest:
-            return model, jnp.array(True)
-        impacts, inner = self.impacts, model.in_rates
-        start = inner_state(model, state, t)
-        gaps = impacts.gaps(start.q, model.args)
-        none = jnp.zeros_like(gaps)
-        inner = with_resting(inner, none)
-        rates = impacts.rates(inner, start)
-        # A gap is round-off beside the coordinates that it depends on.
-        _, size = jax.jvp(
-            lambda q: impacts.gaps(q, model.args), (start.q,), (jnp.abs(start.q),)
+            forces = jnp.zeros((len(self.events),), state.q.dtype)
+            return model, forces, jnp.array(True)
+        impacts, start = self.impacts, inner_state(model, state, t)
+        q, qdot = start.q, model.in_rates.lift(start.q, start.v)
+        gaps = lambda q: impacts.gaps(q, model.args)
+        # The sizes of the terms of the gaps and of their rates.
+        value, size = jax.jvp(gaps, (q,), (jnp.abs(q),))
+        rate, speed = (jax.jvp(gaps, (q,), (x,))[1] for x in (qdot, jnp.abs(qdot)))
+        rounding = 1e3 * jnp.finfo(q.dtype).eps
+        touching = jnp.abs(value) <= rounding * jnp.maximum(jnp.abs(size), 1e-3)
+        still = jnp.abs(rate) <= rounding * jnp.abs(speed)
+        none, instant = jnp.zeros_like(value), jnp.asarray(rounding, value.dtype)
+        resting, forces, ended = impacts.consistent(
+            model.in_rates, start, none, touching & still, instant
         )
-        acceleration, _ = impacts.motion(inner, start)
-        rounding = 1e3 * jnp.finfo(gaps.dtype).eps
-        touching = jnp.abs(gaps) <= rounding * jnp.maximum(jnp.abs(size), 1e-3)
-        still = jnp.abs(rates) <= rounding * (jnp.abs(acceleration) + jnp.abs(rates))
-        instant = rounding * jnp.ones((), gaps.dtype)
-        resting, ended = impacts.consistent(inner, start, none, touching & still, instant)
-        return with_resting(model, resting), ended
+        return with_resting(model, resting), self._of_events(forces), ended
 
     def _slopes(
         self, model: AbstractModel, state: State, t: Scalar
@@ -333,12 +341,14 @@ class Watcher(eqx.Module):
 
         They are those of the functions of the user, also where gaps are closed.
         """
-        in_rates = model.to_rates(state)
-        qdot, vdot = rates(model.in_rates, in_rates)
+        in_rates, inner = model.to_rates(state), model.in_rates
+        qdot, vdot = inner.lift(in_rates.q, in_rates.v), jnp.zeros_like(in_rates.v)
+        if not self._is_impact.all():
+            vdot = inner.accelerations(in_rates)[0]
 
         def values(q, v, t):
             timed = None if state.t is None else t
-            user = model.in_rates.to_user(State(q, v, timed))
+            user = inner.to_user(State(q, v, timed))
             values = [event.value(user, t, model.args) for event in self.events]
             return jnp.stack(values).astype(q.dtype)
 
@@ -486,13 +496,14 @@ class Watcher(eqx.Module):
         """
         varying = self.varying(model) if self.changes_model else None
         zero, yes = jnp.zeros((), state.q.dtype), jnp.array(True)
+        no_forces = jnp.zeros((len(self.events),), state.q.dtype)
         if not self.changes_state.any():
-            return Changed(state, varying, zero, yes)
+            return Changed(state, varying, no_forces, zero, yes)
 
         def change(state: State) -> Changed:
             before = inner_state(model, state, t)
             changed, after = self._reset(model, before, t, happens, remade)
-            after, changed, resolved = self._hit(changed, after, happens, h)
+            after, changed, forces, resolved = self._hit(changed, after, happens, h)
             energy = lambda model, x: (
                 model.in_rates.kinetic(x) + model.in_rates.potential(x)
             )
@@ -505,11 +516,12 @@ class Watcher(eqx.Module):
             return Changed(
                 jax.tree.map(keep, state, new),
                 jax.tree.map(keep, varying, new_varying),
+                forces,
                 keep(zero, lost),
                 same | resolved,
             )
 
-        none = lambda state: Changed(state, varying, zero, yes)
+        none = lambda state: Changed(state, varying, no_forces, zero, yes)
         changed = jnp.any(happens & jnp.asarray(self.changes_state))
         return jax.lax.cond(in_any_lane(changed), change, none, state)
 
@@ -538,35 +550,41 @@ class Watcher(eqx.Module):
 
     def _hit(
         self, model: AbstractModel, state: State, happens: Array, h: Scalar
-    ) -> tuple[State, AbstractModel, Flag]:
-        """The state, in rates, and the model after all impacts."""
+    ) -> tuple[State, AbstractModel, Float[Array, " events"], Flag]:
+        """The state, in rates, and the model after all impacts, and the forces of gaps."""
         if not self._is_impact.any():
-            return state, model, jnp.array(True)
+            none = jnp.zeros((len(self.events),), state.q.dtype)
+            return state, model, none, jnp.array(True)
         numbers = np.flatnonzero(self._is_impact)
         hits = self.impacts.after(model.in_rates, state, happens[numbers], h)
         if hits.resting is not None:
             model = with_resting(model, hits.resting)
-        return hits.state, model, hits.resolved
+        return hits.state, model, self._of_events(hits.forces), hits.resolved
 
     def watch_after(
         self,
         watch: Watch,
         model: AbstractModel,
-        state: State,
+        changed: Changed,
         t: Scalar,
+        found: Found,
         happens: Array,
-        values: Float[Array, " events"],
     ) -> Watch:
-        """What is known at the start of the next step, after an accepted one.
-
-        `values` are the functions at its end, before the events.
-        """
+        """What is known at the start of the next step, after an accepted one, and after the
+        events that happen at its end."""
+        state = State(
+            changed.state.q, changed.state.v, t if model.system.is_timed else None
+        )
+        values = found.values
         if self.changes_state.any():
-            values = jax.lax.cond(
-                in_any_lane(jnp.any(happens)),
-                lambda: self.values(model, state, t),
-                lambda: values,
-            )
+
+            def after() -> Float[Array, " events"]:
+                values = self._of_user(model, state, t)
+                return jnp.where(self.closed(model), changed.forces, values)
+
+            happened = jnp.any(happens)
+            new = jax.lax.cond(in_any_lane(happened), after, lambda: values)
+            values = jnp.where(happened, new, values)
         values = jax.lax.stop_gradient(values)
         closed = self.closed(model)
         sizes = watch.sizes_with(values, closed)

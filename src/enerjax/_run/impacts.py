@@ -72,10 +72,12 @@ def resting_of(model: AbstractModel) -> Resting:
 
 
 class Hits(eqx.Module):
-    """What impacts do: the state and the gaps after them, and whether all gaps open."""
+    """What impacts do: the state after them, the gaps that stay closed and their forces,
+    and whether all other gaps open."""
 
     state: State
     resting: Resting | None
+    forces: Float[Array, " gaps"]
     resolved: Flag
 
 
@@ -157,13 +159,15 @@ class Impacts(eqx.Module):
             resting, happens = jnp.where(released, 0.0, resting), happens & ~released
         state, resting, resolved = self._hit(model, state, happens, resting)
         if resting is None:
-            return Hits(state, None, resolved)
+            return Hits(state, None, jnp.zeros_like(happens, h.dtype), resolved)
         inelastic = self.restitutions(model.args, h.dtype) < 1
         before = resting
-        resting, ended = self.consistent(model, state, resting, happens & inelastic, h)
+        resting, forces, ended = self.consistent(
+            model, state, resting, happens & inelastic, h
+        )
         held = project_velocity(with_resting(model, resting), state, ())[0]
         v = jnp.where(jnp.any(resting > before), held, state.v)
-        return Hits(State(state.q, v, state.t), resting, resolved & ended)
+        return Hits(State(state.q, v, state.t), resting, forces, resolved & ended)
 
     def _hit(
         self,
@@ -185,16 +189,21 @@ class Impacts(eqx.Module):
 
             def by_unit_impulse(held: Resting | None) -> Velocities:
                 inner = model if held is None else with_resting(model, held)
-                admitted = lambda v: project_velocity(inner, State(q, v, state.t), ())[0]
-                return admitted(v + weight @ slope) - admitted(v)
+                pushed = State(q, v + weight @ slope, state.t)
+                return project_velocity(inner, pushed, ())[0] - v
 
-            pressed = resting
-            if resting is not None:
+            if resting is None:
+                pressed, change = None, by_unit_impulse(None)
+            else:
                 # A closed gap transmits the impact if this presses it, and opens if not.
-                free = by_unit_impulse(jnp.zeros_like(resting))
-                moved = jax.jvp(rates, (v,), (free,))[1]
-                pressed = jnp.where(moved < 0, resting, 0.0)
-            change = by_unit_impulse(pressed)
+                def press(held: Resting, _: None) -> tuple[Resting, tuple]:
+                    change = by_unit_impulse(held)
+                    moved = jax.jvp(rates, (v,), (change,))[1]
+                    return jnp.where(moved < 0, resting, 0.0), (held, change)
+
+                none = jnp.zeros_like(resting)
+                _, tried = jax.lax.scan(press, none, None, length=2)
+                pressed, change = jax.tree.map(lambda x: x[-1], tried)
             rate = rates(v)[k]
 
             def correct(impulse: Scalar, _: None) -> tuple[Scalar, None]:
@@ -224,8 +233,9 @@ class Impacts(eqx.Module):
         resting: Resting,
         touching: Bool[Array, " gaps"],
         h: Scalar,
-    ) -> tuple[Resting, Flag]:
-        """The gaps that stay closed, and whether the search for them has ended.
+    ) -> tuple[Resting, Float[Array, " gaps"], Flag]:
+        """The gaps that stay closed, their forces, and whether the search for them has
+        ended.
 
         No force pulls, and every gap stays closed that is `touching` and would close again
         within the time `h`. Gaps open before others close.
@@ -233,15 +243,15 @@ class Impacts(eqx.Module):
         rounding = jnp.finfo(h.dtype).eps ** 0.5
         rate = self.rates(model, state)
 
-        def improve(resting: Resting, _: None) -> tuple[Resting, Flag]:
+        def improve(resting: Resting, _: None) -> tuple[Resting, tuple[Array, Flag]]:
             acceleration, force = self.motion(with_resting(model, resting), state)
             pulls = force < -rounding * jnp.max(jnp.abs(force))
             # The next hit is due after the time `2 rate / -acceleration`.
             closes = touching & (acceleration < 0) & (2 * rate < -h * acceleration)
             closes = jnp.where(closes & ~jnp.any(pulls), 1.0, resting)
             new = jnp.where(pulls, 0.0, closes).astype(h.dtype)
-            return new, jnp.all(new == resting)
+            return new, (force, jnp.all(new == resting))
 
         length = 2 * len(self.impacts) + 1
-        resting, ended = jax.lax.scan(improve, resting, None, length=length)
-        return jax.lax.stop_gradient(resting), ended[-1]
+        resting, (forces, ended) = jax.lax.scan(improve, resting, None, length=length)
+        return jax.lax.stop_gradient(resting), forces[-1], ended[-1]

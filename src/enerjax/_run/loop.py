@@ -60,11 +60,12 @@ class Stepper(eqx.Module):
         h = plan.unit * plan.first()
         place = jnp.zeros_like(plan.last)
         timed = with_time(model, plan, start, place)
-        watch, varying, opens = None, None, RESULTS.successful
+        watch = varying = opens = None
         if self.watcher is not None:
             watch, varying, opens = self.watcher.begin(model, timed, plan.time(place))
             model = eqx.combine(varying, model)
-        result = first_failure(_check_start(scheme, model, timed, h), opens)
+        result = _check_start(scheme, model, timed, h)
+        result = result if opens is None else first_failure(result, opens)
         acceleration, multipliers = model.accelerations(start)
         return Progress(
             state=State(start.q, start.v),
@@ -226,8 +227,7 @@ def attempt_with_events(
     after, attempt = _advanced(stepper, before, live, place, out, verdict)
     search = select(found.searches & live, found.search, no_search(length.dtype))
     waiting = eqx.tree_at(lambda x: x.search, watch, search)
-    timed = with_time(later, plan, changed.state, place)
-    moved = watcher.watch_after(watch, later, timed, t, happens, found.values)
+    moved = watcher.watch_after(watch, later, changed, t, found, happens)
     good = live & verdict.accepted
     after = eqx.tree_at(
         lambda x: (x.watch, x.varying),
