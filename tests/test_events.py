@@ -261,6 +261,246 @@ def test_more_events_than_allowed_are_a_failure():
     assert sol.result == ej.RESULTS.too_many_events
 
 
+# Functions of all kinds -----------------------------------------------------------------
+
+# A ball in the plane, of which every step is exact.
+THROWN = ej.System(jnp.eye(2), lambda q, args: args["g"] * q[1])
+
+
+def anything(q, v, t, args):
+    c = args["c"]
+    sine = jnp.sin(args["w"] * t + args["phase"])
+    rest = c[3] * v[1] + c[4] * sine + c[5] * q[0] * q[1]
+    return c[0] + c[1] * q[0] + c[2] * q[1] + rest
+
+
+def test_all_zeros_of_a_hundred_random_functions_are_found():
+    # Up to three periods of the sine are in twenty steps: functions are zero at the start,
+    # twice in a step, and nearly touch zero.
+    from scipy.optimize import brentq
+
+    rng = np.random.default_rng(1)
+    lanes, h, num_steps = 100, 0.05, 20
+    args = dict(
+        c=rng.normal(size=(lanes, 6)),
+        w=rng.uniform(1, 25, lanes),
+        phase=rng.uniform(0, 6, lanes),
+        g=rng.uniform(1, 8, lanes),
+    )
+    at_start = slice(None, None, 10)
+    args["c"][at_start, 0] = -(
+        3 * args["c"][at_start, 3]
+        + args["c"][at_start, 4] * np.sin(args["phase"][at_start])
+    )
+
+    def run(args) -> Any:
+        return ej.simulate(
+            THROWN,
+            ej.EnergyPreserving(),
+            ej.State([0.0, 0.0], [1.0, 3.0]),
+            args,
+            h=h,
+            num_steps=num_steps,
+            events=[ej.Event(anything), ej.Event(anything, direction=1)],
+            throw=False,
+        )
+
+    sol = jax.device_get(jax.jit(jax.vmap(run))(args))
+    assert np.all(sol.result == ej.RESULTS.successful)
+    times = np.linspace(1e-9, h * num_steps, 200001)
+    for k in range(lanes):
+        own = {key: value[k] for key, value in args.items()}
+
+        def exact(t, own=own):
+            g = own["g"]
+            q, v = (t, 3 * t - 0.5 * g * t**2), (1.0, 3 - g * t)
+            c, sine = own["c"], np.sin(own["w"] * t + own["phase"])
+            rest = c[3] * v[1] + c[4] * sine + c[5] * q[0] * q[1]
+            return c[0] + c[1] * q[0] + c[2] * q[1] + rest
+
+        values = exact(times)
+        changes = np.flatnonzero(np.sign(values[1:]) != np.sign(values[:-1]))
+        zeros: Any = [brentq(exact, *times[j : j + 2], xtol=1e-15) for j in changes]
+        found = sol.events.ts[k][: sol.events.count[k]]
+        np.testing.assert_allclose(found, zeros, atol=1e-12, err_msg=str(k))  # round-off
+        rising = sol.events.happened[k][: len(zeros), 1]
+        np.testing.assert_array_equal(rising, values[changes] < 0)
+
+
+# Events that change a law ----------------------------------------------------------------
+
+
+def test_dry_friction_changes_its_sign_where_the_motion_turns():
+    # x'' + x = -sign(x'): each swing is half a period about -1 or 1, exact in closed form.
+    system = ej.System(
+        jnp.eye(1),
+        lambda q, args: 0.5 * q @ q,
+        force=lambda q, v, t, args: -args["sign"] * jnp.ones(1),
+    )
+    turn = ej.Event(
+        lambda q, v, t, args: v[0], reset_args=lambda q, v, t, args: {"sign": -args["sign"]}
+    )
+    ts = jnp.linspace(0.0, 12.0, 25)
+    sol: Any = ej.simulate(
+        system,
+        ej.EnergyPreserving(),
+        ej.State([12.0], [6.0]),
+        dict(sign=1.0),
+        h=0.01,
+        t1=12.0,
+        events=turn,
+        saveat=ej.SaveAt(ts=ts),
+    )
+    first = np.sqrt(13.0**2 + 6**2) - 1
+    exact = [first, -(first - 2), first - 4, -(first - 6)]
+    count = int(sol.events.count)
+    # Midpoint steps keep the energy of a harmonic motion, so turning points are exact.
+    np.testing.assert_allclose(sol.events.before.q[:count, 0], exact[:count], rtol=1e-12)
+    assert count == 4
+    # Rows within steps that an event has ended; of order 2.
+    phase = np.arctan2(6, 13)
+    early = np.asarray(ts) < phase
+    np.testing.assert_allclose(
+        sol.ys.q[early, 0],
+        -1 + np.hypot(13, 6) * np.cos(np.asarray(ts)[early] - phase),
+        atol=1e-4,
+    )
+    # The force is counted with the sign that it had.
+    assert np.abs(sol.audit.leak).max() < 1e-12
+
+
+# Gaps that stay closed -------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def resting():
+    return falling(jnp.array([1.0, 0.5, 9.81, 0.01]), 2.0, max_steps=200, max_events=30)
+
+
+def test_bounces_that_accumulate_end_in_rest(resting):
+    count = int(resting.events.count)
+    limit = FIRST * (1 + 0.5) / (1 - 0.5)
+    # The last hit is that of which the next would follow within a step.
+    times = FIRST * (2 * np.cumsum(0.5 ** np.arange(12)) - 1)
+    last = np.argmax(np.diff(times) < 0.01)
+    assert count == last + 1
+    np.testing.assert_allclose(resting.events.ts[:count], times[:count], rtol=1e-13)
+    assert abs(resting.events.ts[count - 1] - limit) < 0.01 / (1 - 0.5)
+    assert np.asarray(resting.events.closed[:count, 0]).tolist() == [False] * last + [True]
+    assert np.abs(resting.end.q[0]) < 1e-15
+    assert np.abs(resting.end.v[0]) < 1e-15
+    # All of the energy is gone, and the floor carries the weight.
+    np.testing.assert_allclose(resting.audit.impact.sum(), 9.81, rtol=1e-13)
+    np.testing.assert_allclose(resting.events.contact_forces[-1], 9.81, rtol=1e-10)
+    assert resting.multipliers.shape[1] == 0
+
+
+def test_a_particle_leaves_a_sphere_where_the_force_would_pull():
+    # From energy and Newton's law: at the height 2/3 + v0^2/(3 g) of a sphere of radius 1.
+    v0 = 0.3
+    particle = ej.System(jnp.eye(2), lambda q, args: 9.81 * q[1])
+    sol: Any = ej.simulate(
+        particle,
+        ej.EnergyPreserving(),
+        ej.State([0.0, 1.0], [v0, 0.0]),
+        h=0.02,
+        t1=1.0,
+        saveat=ej.SaveAt(every=1),
+        events=ej.Impact(lambda q, args: jnp.sqrt(q @ q) - 1, 0.5),
+    )
+    assert sol.events.count == 1
+    # The height is a matter of energy and not of time, so there is round-off alone.
+    height = 2 / 3 + v0**2 / (3 * 9.81)
+    np.testing.assert_allclose(sol.events.before.q[0, 1], height, rtol=1e-10)
+    held = np.asarray(sol.ts) < float(sol.events.ts[0])
+    radius = np.linalg.norm(sol.ys.q, axis=1)
+    assert np.abs(radius[held] - 1).max() < 1e-14
+    assert np.all(radius[~held] > 1)
+    forces = np.asarray(sol.events.contact_forces[:, 0])
+    assert np.all(forces[held][1:] > 0)
+    assert np.all(forces[~held][1:] == 0)
+
+
+def test_a_growing_force_lifts_a_block_and_the_time_has_derivatives():
+    block = ej.System(
+        jnp.eye(1), lambda q, a: 9.81 * q[0], force=lambda q, v, t, a: jnp.stack([a * t**2])
+    )
+
+    def lifted(a) -> Any:
+        floor = ej.Impact(lambda q, a: q[0], 0.5)
+        sol: Any = ej.simulate(
+            block,
+            ej.EnergyPreserving(),
+            ej.State([0.0], [0.0]),
+            a,
+            h=0.013,
+            t1=1.3,
+            max_steps=110,
+            events=floor,
+        )
+        return sol.events.ts[0]
+
+    time, slope = jax.jit(lambda a: jax.jvp(lifted, (a,), (jnp.ones(()),)))(8.0)
+    exact = np.sqrt(9.81 / 8)
+    np.testing.assert_allclose(time, exact, rtol=1e-12)  # round-off
+    np.testing.assert_allclose(slope, -0.5 * exact / 8, rtol=1e-11)
+
+
+def test_a_start_with_a_closed_gap_is_a_failure():
+    for q, v in ((-1e-3, 0.0), (0.0, -1.0)):
+        sol: Any = ej.simulate(
+            BALL,
+            ej.EnergyPreserving(),
+            ej.State([q], [v]),
+            dict(g=9.81),
+            h=0.01,
+            num_steps=3,
+            events=ej.Impact(height, 0.5),
+            throw=False,
+        )
+        assert sol.result == ej.RESULTS.gap_closed_at_start
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("e", [1.0, 0.5, 0.0])
+def test_a_rod_that_falls_flat_hits_with_both_ends(e):
+    # By symmetry the rod must not turn, and its centre moves like a ball.
+    rod = ej.System(jnp.diag(jnp.array([1.0, 1.0, 1 / 12])), lambda q, args: 9.81 * q[1])
+    ends = [
+        ej.Impact(lambda q, args, side=side: q[1] + side * 0.5 * jnp.sin(q[2]), e)
+        for side in (-1, 1)
+    ]
+    sol: Any = ej.simulate(
+        rod,
+        ej.EnergyPreserving(),
+        ej.State([0.0, 1.0, 0.0], jnp.zeros(3)),
+        h=0.01,
+        num_steps=60,
+        events=ends,
+    )
+    before, after = sol.events.before.v[0], sol.events.after.v[0]
+    energy = lambda v: 0.5 * (v[1] ** 2 + v[2] ** 2 / 12)
+    lost = (1 - e**2) * energy(before)
+    if e != 0.5:
+        # In turn the ends are hit without loss, or until both are at rest.
+        np.testing.assert_allclose(energy(before) - energy(after), lost, atol=1e-8)
+    assert np.all(np.asarray(sol.events.happened[0]))
+    assert np.abs(sol.audit.leak).max() < 1e-13
+
+
+def test_a_controller_goes_on_with_the_length_that_it_had():
+    controlled = falling(
+        jnp.array([1.0, 0.9, 9.81, 0.01]),
+        1.5,
+        max_steps=None,
+        controller=ej.StepController(1e-6, 1e-6),
+    )
+    np.testing.assert_allclose(controlled.events.ts[:2], BOUNCES[:2], rtol=1e-13)
+    # Steps of a parabola have no error, so they become long whatever the events.
+    assert controlled.stats.completed_steps < 20
+    assert controlled.stats.rejected_steps == 0
+
+
 # Bad input -------------------------------------------------------------------------------
 
 NO_FUNCTION: Any = 1.0

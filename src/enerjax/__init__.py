@@ -26,7 +26,6 @@ from ._programs import enable_fast_loops as enable_fast_loops
 from ._results import RESULTS as RESULTS
 from ._run import (
     AbstractController as AbstractController,
-    AbstractEvent as AbstractEvent,
     Audit as Audit,
     EqualSteps as EqualSteps,
     Event as Event,
@@ -69,6 +68,7 @@ from ._tools.measure import (
 from ._tools.sweep import Sweep as Sweep, sweep as sweep
 from .scenes import (
     bodies as bodies,
+    contacts as contacts,
     drives as drives,
     forces as forces,
     Gap as Gap,

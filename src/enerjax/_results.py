@@ -64,6 +64,15 @@ class RESULTS(eqx.Enumeration):
         "Bounces that become ever shorter have no end: let a terminal event end the run "
         "before, or lengthen the run only to where they accumulate."
     )
+    gap_closed_at_start = (
+        "The gap of an `Impact` is negative at the start, or it is zero and closes. Start "
+        "with open gaps, or with gaps that are zero and at rest."
+    )
+    impacts_unresolved = (
+        "After impacts that happened at once, a gap still closes, or closed gaps keep "
+        "changing. Impacts are applied one after another: change their order, or let them "
+        "happen one by one."
+    )
     interrupted = (
         "The run was interrupted. The same call with `resume=solution`, or with the same "
         "`checkpoint`, makes the rest."
@@ -83,6 +92,8 @@ _NAMES = (
     "steps_too_short",
     "event_not_found",
     "too_many_events",
+    "gap_closed_at_start",
+    "impacts_unresolved",
     "interrupted",
 )
 

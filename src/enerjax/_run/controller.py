@@ -9,7 +9,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float, PyTree
 
 from .._operators import AbstractModel
-from .._programs import is_known
+from .._programs import in_any_lane, is_known
 from .._results import RESULTS
 from .._solvers import ROOT
 from .._system import State
@@ -163,6 +163,28 @@ class _ControlledPlan(AbstractPlan):
         length = jnp.minimum(memory.length, 0.5 * left)
         length = jnp.where(last, left, length)
         return jnp.where(last, 1.0, place + length), length
+
+    def usual(self, memory: _Memory) -> Scalar:
+        return memory.length
+
+    def after_event(
+        self,
+        old: _Memory,
+        new: _Memory,
+        model: AbstractModel,
+        state: State,
+        happened: Flag,
+    ) -> _Memory:
+        def changed(new: _Memory) -> _Memory:
+            # The step was as short as the event wanted, which says nothing of the error.
+            length = jnp.where(happened, jnp.maximum(old.length, new.length), new.length)
+            at_start = _constant(rates(model, state))
+            keep = lambda x, y: jnp.where(happened, x, y)
+            at_start = jax.tree.map(keep, at_start, new.rates)
+            where = lambda memory: (memory.length, memory.rates)
+            return eqx.tree_at(where, new, (length, at_start))
+
+        return jax.lax.cond(in_any_lane(happened), changed, lambda new: new, new)
 
     def warm(self, memory: _Memory, warm: Warm, length: Scalar) -> Warm:
         stages = for_length(warm.stages, self.stages, memory.before, length)

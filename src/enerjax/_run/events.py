@@ -18,10 +18,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from typing_extensions import TypeAliasType
 
-from .._analysis import project_velocity
-from .._operators import AbstractModel
 from .._programs import is_known
-from .._system import HamiltonianSystem, State
+from .._system import State
 from .._types import Args, Coordinates, Count, Real, Scalar, Velocities
 from .inputs import positive_integer
 
@@ -42,22 +40,13 @@ class AbstractEvent(eqx.Module):
     direction: eqx.AbstractVar[int]
     terminal: eqx.AbstractVar[bool]
 
-    @property
-    @abc.abstractmethod
-    def changes_state(self) -> bool:
-        """Whether the state after the event is another one."""
-
     @abc.abstractmethod
     def value(self, state: State, t: Scalar, args: Args) -> Scalar:
         """The function whose zeros are the events; `state` is one of the user."""
 
-    @abc.abstractmethod
-    def after(self, model: AbstractModel, state: State, t: Scalar) -> State:
-        """The state after the event; both are states of `model`, which is `in_rates`."""
-
 
 class Event(AbstractEvent):
-    """A zero of `fn(q, v, t, args)`, at which the run ends or the state changes.
+    """A zero of `fn(q, v, t, args)`, at which the run ends, or the state or `args` change.
 
     The step that contains the zero ends there, to round-off, and satisfies the step
     equations. Times of events have the order of the scheme, and derivatives.
@@ -71,6 +60,10 @@ class Event(AbstractEvent):
       and `Solution.end` is the state at the event.
     - `reset`: a function `reset(q, v, t, args)` that returns the pair `(q, v)` after the
       event. It must satisfy the constraints. Leave it out if the state does not change.
+    - `reset_args`: a function `reset_args(q, v, t, args)` that returns the `args` after the
+      event: a latch that opens, a law that switches. Shapes and types stay the same, and
+      so must the numbers that are part of the program, such as integers. It is called
+      with the state before the event. Leave it out if `args` do not change.
 
     **Raises:** `TypeError` for what is no function; `ValueError` for another direction.
     """
@@ -79,11 +72,12 @@ class Event(AbstractEvent):
     direction: int = eqx.field(static=True, default=0, kw_only=True)
     terminal: bool = eqx.field(static=True, default=False, kw_only=True)
     reset: StateFunction | None = eqx.field(default=None, kw_only=True)
+    reset_args: StateFunction | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):
-        for name in ("fn", "reset"):
+        for name in ("fn", "reset", "reset_args"):
             fn = getattr(self, name)
-            if not (callable(fn) or (name == "reset" and fn is None)):
+            if not (callable(fn) or (name != "fn" and fn is None)):
                 raise TypeError(
                     f"`{name}` must be a function of (q, v, t, args), got {fn!r}."
                 )
@@ -93,10 +87,6 @@ class Event(AbstractEvent):
                 f"got {self.direction!r}."
             )
 
-    @property
-    def changes_state(self) -> bool:
-        return self.reset is not None
-
     def value(self, state: State, t: Scalar, args: Args) -> Scalar:
         value = jnp.asarray(self.fn(state.q, state.v, t, args))
         if value.shape != ():
@@ -105,17 +95,43 @@ class Event(AbstractEvent):
             )
         return value
 
-    def after(self, model: AbstractModel, state: State, t: Scalar) -> State:
+    def state_after(self, state: State, t: Scalar, args: Args) -> State:
+        """The user's state after the event."""
         if self.reset is None:
             return state
-        user = model.to_user(state)
-        q, v = (jnp.asarray(x) for x in self.reset(user.q, user.v, t, model.args))
-        if (q.shape, v.shape) != (user.q.shape, user.v.shape):
+        q, v = (jnp.asarray(x) for x in self.reset(state.q, state.v, t, args))
+        if (q.shape, v.shape) != (state.q.shape, state.v.shape):
             raise ValueError(
-                f"`reset` must return (q, v) of the shapes {user.q.shape} and "
-                f"{user.v.shape}, got {q.shape} and {v.shape}."
+                f"`reset` must return (q, v) of the shapes {state.q.shape} and "
+                f"{state.v.shape}, got {q.shape} and {v.shape}."
             )
-        return model.to_internal(State(q, v, state.t))
+        return State(q.astype(state.q.dtype), v.astype(state.v.dtype))
+
+    def args_after(self, state: State, t: Scalar, args: Args) -> Args:
+        """The `args` after the event; only their inexact arrays may be others."""
+        if self.reset_args is None:
+            return args
+        old, rest = eqx.partition(args, eqx.is_inexact_array)
+        new = self.reset_args(state.q, state.v, t, args)
+        if jax.tree.structure(new) != jax.tree.structure(args):
+            raise ValueError(
+                "`reset_args` must return `args` of the same structure, "
+                f"{jax.tree.structure(args)}, got {jax.tree.structure(new)}."
+            )
+
+        def changed(x: Any, y: Any) -> Any:
+            y = jnp.asarray(y)
+            if y.shape != x.shape:
+                raise ValueError(
+                    f"`reset_args` must not change shapes: {x.shape} became {y.shape}."
+                )
+            return y.astype(x.dtype)
+
+        is_none = lambda x: x is None
+        numbers = jax.tree.map(
+            lambda x, y: None if x is None else changed(x, y), old, new, is_leaf=is_none
+        )
+        return eqx.combine(numbers, rest)
 
 
 class Impact(AbstractEvent):
@@ -125,12 +141,20 @@ class Impact(AbstractEvent):
     by an impulse along the gradient of the gap that changes no constraint and no velocity
     constraint. The energy changes by `-(1 - restitution^2)/2 rate_before^2 / w` with the
     inverse inertia `w` along the gradient, on the constraints; the audit counts the loss as
-    `impact`.
+    `impact`. Impacts that happen at once are applied one after another, in their order,
+    until all of these gaps open.
+
+    A gap stays closed if its next hit would follow within the length of a step: its rate is
+    then set to zero, and it is a constraint until its force would pull. Bounces that become
+    ever shorter thus end. Elastic impacts (`restitution` 1, not traced) never stay closed.
 
     **Arguments:**
 
     - `gap`: `gap(q, args)`, a scalar that must not become negative: a distance or angle.
     - `restitution`: a number from 0 to 1, or a function of `args`.
+
+    There is no friction. Contacts of many bodies with Coulomb friction are problems of
+    another kind, for which other programs exist.
 
     **Raises:** `TypeError` for a gap that is no function, `ValueError` for a known
     restitution outside of [0, 1].
@@ -152,35 +176,19 @@ class Impact(AbstractEvent):
         if known is not None and not np.all((known >= 0) & (known <= 1)):
             raise ValueError(f"`restitution` must be in [0, 1], got {e}.")
 
-    @property
-    def changes_state(self) -> bool:
-        return True
-
-    def value(self, state: State, t: Scalar, args: Args) -> Scalar:
-        value = jnp.asarray(self.gap(state.q, args))
+    def distance(self, q: Coordinates, args: Args) -> Scalar:
+        value = jnp.asarray(self.gap(q, args))
         if value.shape != ():
             raise ValueError(f"`gap` must return a scalar, got shape {value.shape}.")
-        return value
+        return value.astype(q.dtype)
 
-    def after(self, model: AbstractModel, state: State, t: Scalar) -> State:
-        q, v = state.q, state.v
-        normal = jax.grad(lambda q: self.value(State(q, v), t, model.args))(q)
-        rate_of = lambda v: normal @ model.lift(q, v)
-        rate, slope = jax.value_and_grad(rate_of)(v)
-        # The change of the velocities by a unit impulse, with all constraints held.
-        admitted = lambda v: project_velocity(model, State(q, v, state.t), ())[0]
-        change = admitted(v + model.inverse_regular_metric(state) @ slope) - admitted(v)
-        e = self.restitution(model.args) if callable(self.restitution) else self.restitution
-        target, gain = -jnp.asarray(e, rate.dtype) * rate, slope @ change
-        # One correction is exact where the rate is linear in the velocities or momenta.
-        corrections = 8 if isinstance(model.system, HamiltonianSystem) else 1
+    def value(self, state: State, t: Scalar, args: Args) -> Scalar:
+        return self.distance(state.q, args)
 
-        def correct(impulse: Scalar, _: None) -> tuple[Scalar, None]:
-            return impulse + (target - rate_of(v + impulse * change)) / gain, None
-
-        none = jnp.zeros_like(rate)
-        impulse, _ = jax.lax.scan(correct, none, None, length=corrections)
-        return State(q, jnp.where(rate < 0, v + impulse * change, v), state.t)
+    def coefficient(self, args: Args, dtype: Any) -> Scalar:
+        """The restitution."""
+        e = self.restitution(args) if callable(self.restitution) else self.restitution
+        return jnp.asarray(e, dtype)
 
 
 def checked_events(events: Any, max_events: Any) -> tuple[tuple[AbstractEvent, ...], int]:
@@ -200,13 +208,19 @@ class Events(eqx.Module):
     """The events of a run, in the order of time. Entries after the last event are NaN.
 
     - `ts`: their times, shape `(max_events,)`.
-    - `happened`: which events happened at each time, shape `(max_events, events)`.
+    - `happened`: which events happened at each time, shape `(max_events, events)`. For an
+      `Impact` this is a hit, or the release of a gap that has stayed closed.
+    - `closed`: which gaps stay closed after each time, shape `(max_events, events)`.
     - `before`, `after`: the states on both sides, with `q` of shape `(max_events, nq)`.
     - `count`: the number of times.
+    - `contact_forces`: the forces of gaps that stay closed, in the steps that end at the
+      rows of the solution, shape `(times, events)`; zero for all others.
     """
 
     ts: Float[Array, " max_events"]
     happened: Bool[Array, "max_events events"]
+    closed: Bool[Array, "max_events events"]
     before: State
     after: State
     count: Count
+    contact_forces: Float[Array, "times events"]

@@ -18,14 +18,15 @@ from .event_search import Found, Happening, no_search, settle, Watch, Watcher
 from .halving import select
 from .reverse import keep_roots, loops
 from .saving import Begin, Costs, Record, with_time
-from .step import advance, first_warm, StepOutput, Warm
+from .step import advance, first_warm, model_for, StepOutput, Warm
 from .step_sizes import AbstractPlan, Verdict
 
 
 class Progress(eqx.Module):
     """The carry of the loop over the steps; after a failure, that of the last good step.
 
-    `watch` is `None` in a run without events.
+    `watch` is `None` in a run without events, and `varying`, the part of the model that
+    events change, in a run in which no event changes the model.
     """
 
     state: State
@@ -36,6 +37,7 @@ class Progress(eqx.Module):
     completed: Count
     multipliers: Multipliers
     watch: Watch | None = None
+    varying: PyTree[Any] = None
 
 
 class Stepper(eqx.Module):
@@ -48,29 +50,41 @@ class Stepper(eqx.Module):
     max_halvings: int | None = eqx.field(static=True)
     watcher: Watcher | None = None
 
+    def model_at(self, progress: Progress) -> AbstractModel:
+        """The model that events have left."""
+        return eqx.combine(progress.varying, self.model)
+
     def begin(self, start: State) -> Progress:
         """The carry at the start of a run; `start` is a state of the model."""
         scheme, model, plan = self.scheme, self.model, self.plan
-        acceleration, multipliers = model.accelerations(start)
         h = plan.unit * plan.first()
         place = jnp.zeros_like(plan.last)
         timed = with_time(model, plan, start, place)
+        watch = varying = opens = None
+        if self.watcher is not None:
+            watch, varying, opens = self.watcher.begin(model, timed, plan.time(place))
+            model = eqx.combine(varying, model)
+        result = _check_start(scheme, model, timed, h)
+        result = result if opens is None else first_failure(result, opens)
+        acceleration, multipliers = model.accelerations(start)
         return Progress(
             state=State(start.q, start.v),
             warm=first_warm(scheme, model, start, h, acceleration, multipliers),
             place=place,
             memory=plan.begin(model.in_rates, model.to_rates(timed)),
-            result=_check_start(scheme, model, timed, h),
+            result=result,
             completed=jnp.array(0),
             multipliers=multipliers,
-            watch=self.watcher and self.watcher.begin(model, timed, plan.time(place)),
+            watch=watch,
+            varying=varying,
         )
 
     def attempt(self, before: Progress, live: Flag) -> tuple[Progress, "Attempt"]:
         """Attempts one step. If `live` is false nothing changes, at no cost."""
         model, plan = self.model, self.plan
         if self.watcher is not None:
-            return attempt_with_events(self, self.watcher, before, live)
+            now = eqx.tree_at(lambda x: x.model, self, self.model_at(before))
+            return attempt_with_events(now, self.watcher, before, live)
         place, length = plan.next(before.memory, before.place)
         # A step that is not live gets a positive length, so that no derivative is NaN.
         length = jnp.where(live, length, plan.first())
@@ -128,6 +142,7 @@ def _advanced(
         completed=before.completed + good.astype(before.completed.dtype),
         multipliers=keep(out.multipliers, before.multipliers),
         watch=before.watch,
+        varying=before.varying,
     )
     zero_unless = lambda flag, x: jnp.where(flag, x, jnp.zeros_like(x))
     return after, Attempt(
@@ -156,10 +171,14 @@ class _AttemptWithEvents(eqx.Module):
         before, plan, model = self.before, self.stepper.plan, self.stepper.model
         begin = with_time(model, plan, before.state, before.place)
         out = self.stepper.advance(before, begin, self.length, self.live)
-        assert before.watch is not None
-        end = plan.t0 + plan.unit * (before.place + self.length)
-        values = self.watcher.values(model, out.state, end)
-        found = self.watcher.find(before.watch, values, self.length, before.place)
+        watch = before.watch
+        assert watch is not None
+        times = plan.time(before.place), plan.t0 + plan.unit * (before.place + self.length)
+        values = self.watcher.values(model, out.state, times[1])
+        constant = jax.lax.stop_gradient((begin, out.state)), jax.lax.stop_gradient(times)
+        now = jax.lax.stop_gradient(values)
+        extremum = self.watcher.extremum(model, *constant, watch, now)
+        found = self.watcher.find(watch, values, self.length, extremum)
         return out, found
 
 
@@ -174,40 +193,95 @@ def attempt_with_events(
     length = jnp.where(searching, watch.search.length, length)
     length = jnp.where(live, length, plan.first())
     out, length, found = settle(_AttemptWithEvents(stepper, watcher, before, length, live))
-    happens = found.happens & live
-    place = jnp.where(searching | jnp.any(happens), before.place + length, place)
+    place = jnp.where(searching | jnp.any(found.happens), before.place + length, place)
+    verdict = _judged(stepper, watcher, before, out, length, found)
+    happens = found.happens & live & verdict.accepted
+    t = plan.time(place)
+    changed = watcher.after(
+        model,
+        out.state,
+        t,
+        happens,
+        plan.unit * plan.usual(before.memory),
+        lambda user, args: model_for(stepper.scheme, model.system, user, args),
+    )
+    later = eqx.combine(changed.varying, model)
+    unresolved = verdict.accepted & ~changed.resolved
+    failure = RESULTS.where(unresolved, RESULTS.impacts_unresolved, RESULTS.successful)
+    verdict = Verdict(
+        accepted=verdict.accepted & changed.resolved,
+        result=first_failure(verdict.result, failure),
+        memory=_after_event(stepper, later, before, verdict, changed.state, place, happens),
+    )
+    without_time = lambda state: State(state.q, state.v)
+    happening = Happening(
+        happens=happens,
+        before=without_time(model.to_rates(out.state)),
+        after=without_time(later.to_rates(changed.state)),
+        closed=watcher.closed(later),
+    )
+    energies = eqx.tree_at(
+        lambda x: x.impact, out.energies, changed.lost, is_leaf=lambda x: x is None
+    )
+    out = eqx.tree_at(lambda x: (x.state, x.energies), out, (changed.state, energies))
+    after, attempt = _advanced(stepper, before, live, place, out, verdict)
+    search = select(found.searches & live, found.search, no_search(length.dtype))
+    waiting = eqx.tree_at(lambda x: x.search, watch, search)
+    moved = watcher.watch_after(watch, later, changed, t, found, happens)
+    good = live & verdict.accepted
+    after = eqx.tree_at(
+        lambda x: (x.watch, x.varying),
+        after,
+        (
+            select(good, moved, select(live, waiting, watch)),
+            select(good, changed.varying, before.varying),
+        ),
+        is_leaf=lambda x: x is None,
+    )
+    return after, eqx.tree_at(
+        lambda x: x.happening, attempt, happening, is_leaf=lambda x: x is None
+    )
+
+
+def _judged(
+    stepper: Stepper,
+    watcher: Watcher,
+    before: Progress,
+    out: StepOutput,
+    length: Scalar,
+    found: Found,
+) -> Verdict:
+    """The decision about an attempted step, which is repeated if a zero lies within."""
+    model, plan, watch = stepper.model, stepper.plan, before.watch
+    assert watch is not None
     begin = with_time(model, plan, before.state, before.place)
     ends = model.to_rates(begin), model.to_rates(out.state)
     verdict = plan.judge(before.memory, model.in_rates, ends, out.result, length)
-    searches = verdict.accepted & found.searches
-    too_many = jnp.any(happens) & (watch.count >= watcher.max_events)
+    too_many = jnp.any(found.happens) & (watch.count >= watcher.max_events)
     result = RESULTS.where(too_many, RESULTS.too_many_events, found.result)
     result = RESULTS.where(verdict.accepted, result, RESULTS.successful)
-    verdict = Verdict(
+    searches = verdict.accepted & found.searches
+    return Verdict(
         accepted=verdict.accepted & ~found.searches & ~too_many,
         result=first_failure(verdict.result, result),
         memory=select(searches, before.memory, verdict.memory),
     )
-    happens = happens & verdict.accepted
-    t = plan.time(place)
-    state, lost = watcher.after(model, out.state, t, happens)
-    happening = Happening(happens, model.to_rates(out.state), model.to_rates(state))
-    energies = eqx.tree_at(
-        lambda x: x.impact, out.energies, lost, is_leaf=lambda x: x is None
-    )
-    out = eqx.tree_at(lambda x: (x.state, x.energies), out, (state, energies))
-    after, attempt = _advanced(stepper, before, live, place, out, verdict)
-    search = select(searches & live, found.search, no_search(length.dtype))
-    waiting = eqx.tree_at(lambda x: x.search, watch, search)
-    moved = watcher.watch_after(
-        watch, model, with_time(model, plan, state, place), t, happens
-    )
-    good = live & verdict.accepted
-    after = eqx.tree_at(
-        lambda x: x.watch, after, select(good, moved, select(live, waiting, watch))
-    )
-    return after, eqx.tree_at(
-        lambda x: x.happening, attempt, happening, is_leaf=lambda x: x is None
+
+
+def _after_event(
+    stepper: Stepper,
+    model: AbstractModel,
+    before: Progress,
+    verdict: Verdict,
+    state: State,
+    place: Scalar,
+    happens: Flag,
+) -> PyTree[Any]:
+    """The memory of the plan after a step, which an event may have ended."""
+    plan = stepper.plan
+    user = model.to_rates(with_time(model, plan, state, place))
+    return plan.after_event(
+        before.memory, verdict.memory, model.in_rates, user, jnp.any(happens)
     )
 
 
@@ -215,11 +289,11 @@ def run_loop(
     stepper: Stepper,
     start: State,
     steps_in_group: int,
-    keep: Callable[[State, Scalar], PyTree[Any]],
+    keep: Callable[[AbstractModel], Callable[[State, Scalar], PyTree[Any]]],
 ) -> tuple[Begin, Progress, Record]:
     """Runs all steps, in groups of `steps_in_group` attempts.
 
-    `keep(state, place)` is kept of the state after each group.
+    `keep(model)(state, place)` is kept of the state after each group.
     """
     plan = stepper.plan
     num_groups = -(-plan.max_attempts // steps_in_group)
@@ -244,7 +318,7 @@ def run_loop(
         numbers = jnp.arange(steps_in_group)
         last = jnp.max(jnp.where(attempts.accepted, numbers, 0))
         return after, Record(
-            kept=keep(after.state, after.place),
+            kept=keep(stepper.model_at(after))(after.state, after.place),
             multipliers=after.multipliers,
             details=jax.tree.map(lambda x: x[last], attempts.details),
             energies=jax.tree.map(jnp.sum, attempts.energies),
@@ -252,10 +326,15 @@ def run_loop(
             place=after.place,
             reached=jnp.any(attempts.accepted) & (after.result == RESULTS.successful),
             happening=jax.tree.map(lambda x: x[last], attempts.happening),
+            varying=after.varying,
         )
 
     begin = stepper.begin(start)
-    kept = Begin(keep(begin.state, begin.place), begin.multipliers)
+    kept = Begin(
+        kept=keep(stepper.model_at(begin))(begin.state, begin.place),
+        multipliers=begin.multipliers,
+        varying=begin.varying,
+    )
     end, record = over_groups(one_group, begin, num_groups, jnp.array(True))
     is_whole_run = end.place >= plan.last
     if end.watch is not None:

@@ -144,6 +144,8 @@ class Record(eqx.Module):
     - `place`: how far the run has come, see `AbstractPlan`.
     - `reached`: whether a step of the group was accepted, and none failed.
     - `happening`: the events at the end of the group; `None` in a run without events.
+    - `varying`: the part of the model that events change, after the group; `None` if they
+      change none.
     """
 
     kept: PyTree[Any]
@@ -154,19 +156,23 @@ class Record(eqx.Module):
     place: Float[Array, " groups"]
     reached: Bool[Array, " groups"]
     happening: Happening | None = None
+    varying: PyTree[Any] = None
 
 
 class Begin(eqx.Module):
-    """What is kept of the start of a run, and the multipliers there."""
+    """What is kept of the start of a run, the multipliers there, and the part of the model
+    that events change."""
 
     kept: PyTree[Any]
     multipliers: Multipliers
+    varying: PyTree[Any] = None
 
 
 class RecordedRun(eqx.Module):
     """A run whose rows are still to be made: all that the loop has returned.
 
-    `completed` steps were accepted; `order` is that of the scheme.
+    `model` is that before events change it, for the states that are kept. `completed` steps
+    were accepted; `order` is that of the scheme.
     """
 
     model: AbstractModel
@@ -186,6 +192,7 @@ class Rows(eqx.Module):
     details: PyTree[Any]
     energies: Energies
     costs: Costs
+    varying: PyTree[Any] = None
 
 
 class Standing(eqx.Module):
@@ -411,7 +418,7 @@ class _AtTimes(AbstractSaving):
         at_end = jnp.abs(places - last) <= near
         part = jnp.where(at_end, 1.0, (places - first) / (last - first))
         part = jnp.where(at_start | ~inside, 0.0, part)
-        states = _states_within(run, steps.kept, (number, first, last, part))
+        states = _states_within(run, steps, (number, first, last, part))
         done = jnp.where(part == 1, number + 1, number)
         segment = jnp.searchsorted(done, _number_of_step(record), side="right")
         valid = inside | at_start
@@ -426,6 +433,7 @@ class _AtTimes(AbstractSaving):
             details=jax.tree.map(lambda x: x[1:], _nan_unless(valid, details)),
             energies=_nan_unless(valid, energies),
             costs=record.costs.by_segment(segment, ts.size),
+            varying=jax.tree.map(lambda x: x[done], _with_start(run, steps.varying)),
         )
 
     def is_due(self, plan: AbstractPlan, standing: Standing) -> Flag:
@@ -440,28 +448,41 @@ class _AtTimes(AbstractSaving):
         return self
 
 
+def _with_start(run: RecordedRun, varying: PyTree[Any]) -> PyTree[Any]:
+    """What varies of the model at the start and after each of these steps."""
+    join = lambda x, y: jnp.concatenate([x[None], y])
+    return jax.tree.map(join, run.begin.varying, varying)
+
+
 def _states_within(
-    run: RecordedRun, ends: State, rows: tuple[Count, Scalar, Scalar, Scalar]
+    run: RecordedRun, steps: Record, rows: tuple[Count, Scalar, Scalar, Scalar]
 ) -> State:
     """The states at rows that lie within steps.
 
     A row is the number of its step, the places where this step begins and ends, and the
-    fraction of the step at which the row lies.
+    fraction of the step at which the row lies. At an event it is the state after it.
     """
-    model, plan = run.model, run.plan
+    plan, afters = run.plan, steps.kept
+    ends = afters if steps.happening is None else steps.happening.before
     join = lambda x, y: jnp.concatenate([x[None], y])
-    starts = jax.tree.map(join, run.begin.kept, ends)
+    starts = jax.tree.map(join, run.begin.kept, afters)
+    varying = _with_start(run, steps.varying)
 
     def state_at(row: tuple[Count, Scalar, Scalar, Scalar]) -> State:
         number, first, last, part = row
         pick = lambda tree: jax.tree.map(lambda x: x[number], tree)
+        model = eqx.combine(pick(varying), run.model)
         a = pick(starts)
         # A row that is not reached has no step; its derivatives must still be finite.
         b = jax.tree.map(lambda x, y: jnp.where(part > 0, x, y), pick(ends), a)
         begin, end = with_time(model, plan, a, first), with_time(model, plan, b, last)
         h = plan.unit * (last - first)
         state = state_within(model, begin, end, h, part, run.order)
-        return State(state.q, state.v)
+        after = jax.tree.map(lambda x, y: jnp.where(part == 1, x, y), pick(afters), b)
+        state = jax.tree.map(
+            lambda x, y: jnp.where(part == 1, x, y), after, State(state.q, state.v)
+        )
+        return state
 
     return jax.lax.map(state_at, rows)
 
@@ -512,6 +533,7 @@ def _after_start(
         details=details,
         energies=jax.tree.map(lambda x: jnp.append(jnp.zeros((), x.dtype), x), energies),
         costs=record.costs,
+        varying=jax.tree.map(join, begin.varying, record.varying),
     )
 
 

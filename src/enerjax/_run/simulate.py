@@ -85,9 +85,10 @@ def simulate(
       `stats.halvings` shows where steps were divided.
     - `events`: an `Event`, an `Impact`, or a list of them: zeros of functions of the state,
       at which a step ends exactly, and after which the state may be another one. They are
-      listed in `Solution.events`. Every event is found that changes the sign of its
-      function between the ends of a step; a function that does so twice within a step
-      is not seen, unless it is zero at the start after a change of the state.
+      listed in `Solution.events`, after those of the system. Every zero is found at
+      which a function changes its sign between the ends of a step, and two zeros within a
+      step if the function is as smooth as the motion: if between the zeros it exceeds the
+      error of a cubic interpolation of the step.
     - `max_events`: the number of times at which events may happen; a run that needs more
       fails.
     - `progress`: `True` for a line on stderr that shows how far the run is, or a function
@@ -128,7 +129,7 @@ def simulate(
     plan = controller.plan(scheme, step, begin, end)
     longest = plan.max_attempts if options is None else sys.maxsize
     saving = saving_of(saveat, plan, controller, longest)
-    watcher = watcher_of(events, max_events, scheme, options is not None)
+    watcher = watcher_of(system, events, max_events, scheme, options is not None)
     if watcher is not None:
         saving = with_events(saving, plan)
         plan = plan.with_events(watcher.max_attempts)
@@ -172,9 +173,7 @@ def _run(task: Task) -> tuple[Solution, Scalar]:
     plan, saving, stepper = task.plan, task.saving, task.stepper()
     model = stepper.model
     start = model.to_internal(task.start)
-    begin, end, record = run_loop(
-        stepper, start, saving.steps_in_group(plan), task.keep(model)
-    )
+    begin, end, record = run_loop(stepper, start, saving.steps_in_group(plan), task.keep)
     run = RecordedRun(
         model=model.in_rates,
         plan=plan,
@@ -183,8 +182,9 @@ def _run(task: Task) -> tuple[Solution, Scalar]:
         completed=end.completed,
         order=task.scheme.order,
     )
-    solution = task.solution(model, saving.rows(run), end)
+    rows = saving.rows(run)
+    solution = task.solution(model, rows, end)
     if task.watcher is not None:
-        happened = task.events(model, record)
+        happened = task.events(model, record, rows.multipliers)
         solution = dataclasses.replace(solution, events=happened)
     return solution, plan.time(end.place)

@@ -15,6 +15,7 @@ from .._programs import is_known
 from .._results import from_names, names_of, RESULTS
 from .._system import Names, State
 from .audit import Audit
+from .events import Events
 from .solution import Continuation, Solution, Statistics
 
 
@@ -22,9 +23,8 @@ FORMAT = "enerjax solution"
 # To be raised with every change by which older versions would misread a file.
 VERSION = 1
 _HEADER = "header"
-_MODULES = {
-    cls.__name__: cls for cls in (Audit, Continuation, Names, Solution, State, Statistics)
-}
+_STORED = Audit, Continuation, Events, Names, Solution, State, Statistics
+_MODULES = {cls.__name__: cls for cls in _STORED}
 
 
 def save(path: str | os.PathLike, solution: Solution) -> None:
@@ -138,5 +138,8 @@ def _read(about: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     if kind in ("list", "tuple"):
         parts = [_read(part, arrays) for part in value]
         return parts if kind == "list" else tuple(parts)
-    (_, fields), *_ = others
-    return _MODULES[value](**{key: _read(part, arrays) for key, part in fields.items()})
+    (_, of_fields), *_ = others
+    fields = {key: _read(part, arrays) for key, part in of_fields.items()}
+    if value == "Audit" and "impact" not in fields:  # written before there were impacts
+        fields["impact"] = 0 * fields["dissipated"]
+    return _MODULES[value](**fields)

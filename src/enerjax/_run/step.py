@@ -206,8 +206,14 @@ def step(
 
     **Returns:** a `StepOutput`.
 
-    **Raises:** `ValueError` or `TypeError` for wrong shapes, types and signs.
+    **Raises:** `ValueError` or `TypeError` for wrong shapes, types and signs, and for a
+    system with events.
     """
     state, args, h, _ = prepare(system, scheme, state, args, h, t, root_finder)
     check_halvings(max_halvings)
+    if system.events:
+        raise ValueError(
+            "`step` does not look for events, and this system has some, such as impacts. "
+            "Use `simulate`, or a system without them."
+        )
     return _single_step(system, scheme, state, args, h, warm, root_finder, max_halvings)

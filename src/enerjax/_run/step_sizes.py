@@ -67,6 +67,25 @@ class AbstractPlan(eqx.Module):
         """The place where the step from `place` ends, and the length of this step."""
 
     @abc.abstractmethod
+    def usual(self, memory: PyTree[Any]) -> Scalar:
+        """The length of a step that no event and no end of the run makes shorter."""
+
+    @abc.abstractmethod
+    def after_event(
+        self,
+        old: PyTree[Any],
+        new: PyTree[Any],
+        model: AbstractModel,
+        state: State,
+        happened: Flag,
+    ) -> PyTree[Any]:
+        """The memory after a step that an event has ended, if it has `happened`.
+
+        `old` and `new` are those before and after the step, and `state` is that after the
+        event.
+        """
+
+    @abc.abstractmethod
     def warm(self, memory: PyTree[Any], warm: Warm, length: Scalar) -> Warm:
         """What the last steps pass to a step of this length."""
 
@@ -203,6 +222,14 @@ class _EqualPlan(AbstractPlan):
             return place + 1, self.first()
         following = jnp.floor(place + 1 + NEAR)
         return following, following - place
+
+    def usual(self, memory: None) -> Scalar:
+        return self.first()
+
+    def after_event(
+        self, old: None, new: None, model: AbstractModel, state: State, happened: Flag
+    ) -> None:
+        return None
 
     def warm(self, memory: None, warm: Warm, length: Scalar) -> Warm:
         return warm

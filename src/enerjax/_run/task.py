@@ -6,12 +6,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from .._operators import AbstractModel
 from .._solvers import RootFinder
 from .._system import AbstractSystem, State
-from .._types import Args, Scalar
+from .._types import Args, Coordinates, Scalar
 from ..schemes import AbstractScheme
 from .audit import audit, Measures, measures
 from .event_search import Watcher
@@ -38,9 +38,12 @@ class Task(eqx.Module):
     watcher: Watcher | None = None
 
     def stepper(self) -> Stepper:
+        system, watcher = self.system, self.watcher
+        if watcher is not None:
+            system = watcher.system(system, self.start.q.dtype)
         return Stepper(
             scheme=self.scheme,
-            model=model_for(self.scheme, self.system, self.start, self.args),
+            model=model_for(self.scheme, system, self.start, self.args),
             plan=self.plan,
             root_finder=self.root_finder,
             max_halvings=self.max_halvings,
@@ -76,18 +79,38 @@ class Task(eqx.Module):
         """
         value: PyTree[Any] = model.in_rates.to_user(state)
         if self.fn is not None:
-            value = jax.tree.map(jnp.asarray, self.fn(t, value, self.args))
+            value = jax.tree.map(jnp.asarray, self.fn(t, value, model.args))
         timed = State(state.q, state.v, t if self.system.is_timed else None)
-        return value, measures(model.in_rates, timed)
+        return value, self._measures(model.in_rates, timed)
 
-    def events(self, model: AbstractModel, record: Record) -> Events | None:
-        """The events of a run, from the record of all its attempted steps."""
-        if self.watcher is None:
+    def _measures(self, model: AbstractModel, state: State) -> Measures:
+        """The part of the audit of a state, without the gaps of impacts."""
+        found = measures(model, state)
+        rows = lambda found: (found.constraint, found.constraint_rate)
+        of_user = [self._without_gaps(model, state.q, x) for x in rows(found)]
+        return eqx.tree_at(rows, found, tuple(of_user))
+
+    def _without_gaps(self, model: AbstractModel, q: Coordinates, rows: Array) -> Array:
+        """Rows of constraints without those of the gaps of impacts."""
+        watcher = self.watcher
+        if watcher is None or not watcher.can_rest:
+            return rows
+        return watcher.impacts.without_gaps(model, q, rows)
+
+    def events(
+        self, model: AbstractModel, record: Record, multipliers: Float[Array, "times nc"]
+    ) -> Events | None:
+        """The events of a run, from the record of all its attempted steps.
+
+        `multipliers` are those of the rows, with those of the gaps of impacts.
+        """
+        watcher = self.watcher
+        if watcher is None:
             return None
         happening = record.happening
         assert happening is not None
         happened = jnp.any(happening.happens, axis=1)
-        numbers = jnp.arange(self.watcher.max_events)
+        numbers = jnp.arange(watcher.max_events)
         at = jnp.searchsorted(jnp.cumsum(happened), numbers + 1)
         count = jnp.sum(happened)
         is_event = numbers < count
@@ -98,23 +121,32 @@ class Task(eqx.Module):
             valid = is_event.reshape(-1, *[1] * (x.ndim - 1))
             return jnp.where(valid, x, False if x.dtype == bool else jnp.nan)
 
+        forces = lambda rows: watcher.contact_forces(model, self.start.q, rows)
         return Events(
             ts=picked(jax.vmap(self.plan.time)(record.place)),
             happened=picked(happening.happens),
+            closed=picked(happening.closed),
             before=jax.tree.map(picked, user(happening.before)),
             after=jax.tree.map(picked, user(happening.after)),
             count=count,
+            contact_forces=jax.vmap(forces)(multipliers),
         )
 
     def solution(self, model: AbstractModel, rows: Rows, end: Progress) -> Solution:
         """The solution with these rows, of a run that has ended."""
-        observe = lambda state, t: self._observe(model, state, t)
-        in_loop = self.observes_in_loop
-        ys, measured = rows.kept if in_loop else jax.vmap(observe)(rows.kept, rows.ts)
+
+        def observe(state: State, t: Scalar, varying: PyTree[Any]) -> Any:
+            return self._observe(eqx.combine(varying, model), state, t)
+
+        if self.observes_in_loop:
+            ys, measured = rows.kept
+        else:
+            ys, measured = jax.vmap(observe)(rows.kept, rows.ts, rows.varying)
+        of_user = lambda x: self._without_gaps(model, self.start.q, x)
         return Solution(
             ts=rows.ts,
             ys=ys,
-            multipliers=jax.vmap(model.user_multipliers)(rows.multipliers),
+            multipliers=of_user(jax.vmap(model.user_multipliers)(rows.multipliers)),
             details=rows.details,
             audit=audit(measured, rows.energies),
             stats=Statistics(
@@ -125,7 +157,7 @@ class Task(eqx.Module):
                 completed_steps=end.completed,
                 rejected_steps=self.plan.num_rejected(end.memory),
             ),
-            end=model.to_user(end.state),
+            end=eqx.combine(end.varying, model).to_user(end.state),
             result=end.result,
             names=self.system.names,
         )

@@ -83,6 +83,7 @@ class AbstractSystem(eqx.Module):
     symmetry: eqx.AbstractVar[Symmetry | None]
     redundant: eqx.AbstractVar[bool]
     names: eqx.AbstractVar[Names | None]
+    events: eqx.AbstractVar[tuple]
 
     @property
     def is_timed(self) -> bool:

@@ -57,6 +57,7 @@ class LagrangianSystem(AbstractCanonicalSystem):
     symmetry: Symmetry | None = None
     redundant: bool = eqx.field(default=False, static=True)
     names: Names | None = None
+    events: tuple = ()
 
     def __check_init__(self):
         check_function("kinetic", self.kinetic, "(q, qdot, args)")
@@ -99,6 +100,7 @@ class HamiltonianSystem(AbstractCanonicalSystem):
     symmetry: Symmetry | None = None
     redundant: bool = eqx.field(default=False, static=True)
     names: Names | None = None
+    events: tuple = ()
 
     def __check_init__(self):
         check_functions(self, required="hamiltonian")

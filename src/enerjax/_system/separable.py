@@ -77,6 +77,8 @@ class System(AbstractSystem):
       each body, whose multipliers follow those of `constraint`; they refuse flat bodies,
       for which `E` is singular.
     - `names`: names of coordinates, velocities and constraints for tables; see `Names`.
+    - `events`: events that belong to the system, such as its impacts, in a list. `simulate`
+      looks for them in every run.
 
     `args` is any pytree; the functions must be smooth and written with `jax.numpy`.
 
@@ -95,6 +97,7 @@ class System(AbstractSystem):
     symmetry: Symmetry | None
     redundant: bool = eqx.field(static=True)
     names: Names | None
+    events: tuple
 
     def __init__(
         self,
@@ -110,6 +113,7 @@ class System(AbstractSystem):
         redundant: bool = False,
         rigid_bodies: Any = None,
         names: Names | None = None,
+        events: Any = (),
     ):
         if rigid_bodies is not None and kinematics is not None:
             raise ValueError(
@@ -141,6 +145,7 @@ class System(AbstractSystem):
         self.symmetry = symmetry
         self.redundant = redundant
         self.names = names
+        self.events = tuple(events)
         if rigid_bodies is not None:
             self.kinematics = DirectorKinematics(body_table(rigid_bodies))
         elif kinematics is not None:
@@ -183,6 +188,7 @@ class System(AbstractSystem):
         symmetry: Symmetry | None = None,
         redundant: bool = False,
         names: Names | None = None,
+        events: Any = (),
     ) -> LagrangianSystem:
         """A system whose inertia depends on its coordinates.
 
@@ -199,7 +205,8 @@ class System(AbstractSystem):
         - `constraint`: `constraint(q, args)`, a vector that vanishes in every admissible
           configuration. Leave it out if there is none.
         - `force`: `force(q, qdot, t, args)`, shape `(nq,)`, conjugate to `qdot`.
-        - `driven`: `driven(q, t, args)`; `symmetry`, `redundant`, `names`: see `System`.
+        - `driven`: `driven(q, t, args)`; `symmetry`, `redundant`, `names`, `events`: see
+          `System`.
 
         **Returns:** a system that all functions accept like a `System`; the `v` of a
         `State` is `qdot`, shape `(nq,)`.
@@ -213,6 +220,7 @@ class System(AbstractSystem):
             symmetry=symmetry,
             redundant=redundant,
             names=names,
+            events=tuple(events),
         )
 
     @staticmethod
@@ -225,6 +233,7 @@ class System(AbstractSystem):
         symmetry: Symmetry | None = None,
         redundant: bool = False,
         names: Names | None = None,
+        events: Any = (),
     ) -> HamiltonianSystem:
         """A system given by its Hamiltonian.
 
@@ -241,7 +250,7 @@ class System(AbstractSystem):
           `B(q) dH/dp = 0` for `p`.
         - `force`: `force(q, qdot, t, args)`, shape `(nq,)`, conjugate to `qdot = dH/dp`.
         - `driven`: `driven(q, t, args)`; `symmetry` (rows of `qdot`), `redundant`,
-          `names`: see `System`.
+          `names`, `events`: see `System`.
 
         **Returns:** a system that all functions accept like a `System`; the `v` of a
         `State` is the momentum `p`, shape `(nq,)`. The audit counts `H(q, 0)` as potential
@@ -255,4 +264,5 @@ class System(AbstractSystem):
             symmetry=symmetry,
             redundant=redundant,
             names=names,
+            events=tuple(events),
         )

@@ -2,6 +2,7 @@
 
 from . import (
     bodies as bodies,
+    contacts as contacts,
     drives as drives,
     forces as forces,
     joints as joints,

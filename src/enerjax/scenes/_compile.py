@@ -15,11 +15,12 @@ from ._ends import Ends, Hinge, Hinges
 from ._frames import Frame, GROUND, Numbers
 from ._inerters import AbstractInerter
 from ._law_checks import resolved_part
-from ._laws import Flywheel
+from ._laws import Flywheel, Gap
 from ._layout import Layout, Link, numbers_of
 from ._parameters import Parameters
 from ._pose_view import evaluate, lift, View
 from .bodies import AbstractBody
+from .contacts import AbstractContact
 from .drives import AbstractDrive
 from .forces import AbstractForce, Potential
 from .joints import AbstractJoint, Constraint
@@ -27,14 +28,14 @@ from .joints import AbstractJoint, Constraint
 
 # The kinds of parts that connect two bodies. Joints are first, because other parts depend
 # on the axes that joints keep common to two bodies.
-LINKS = (AbstractJoint, AbstractForce, AbstractDrive, AbstractInerter)
+LINKS = (AbstractJoint, AbstractForce, AbstractDrive, AbstractInerter, AbstractContact)
 
 
 def sort_parts(parts: Sequence[Any]) -> dict[type, list[Any]]:
     """The parts by their class, after checks of their names and dimensions."""
     kinds = (
         AbstractBody, AbstractJoint, AbstractForce, AbstractDrive, AbstractInerter,
-        Constraint, Potential,
+        AbstractContact, Constraint, Potential,
     )  # fmt: skip
     found: dict[type, list[Any]] = {kind: [] for kind in kinds}
     if isinstance(parts, kinds):
@@ -46,7 +47,8 @@ def sort_parts(parts: Sequence[Any]) -> dict[type, list[Any]]:
         kind = next((kind for kind in kinds if isinstance(part, kind)), None)
         if kind is None:
             raise TypeError(
-                f"A scene is made of bodies, joints, forces and drives, got {part!r}."
+                "A scene is made of bodies, joints, forces, drives and contacts, got "
+                f"{part!r}."
             )
         if not isinstance(part.name, str):
             raise TypeError(f"A name must be a string, got {part.name!r}.")
@@ -87,6 +89,10 @@ def compile_parts(
     for kind in LINKS:
         resolved[kind] = [(part, *resolved_part(part, ends(part))) for part in found[kind]]
         ends.hinges = _hinges(ends, resolved[AbstractJoint])
+    # Contacts with a penalty are springs.
+    contacts = resolved[AbstractContact]
+    resolved[AbstractForce] += [x for x in contacts if not isinstance(x[1], Gap)]
+    resolved[AbstractContact] = [x for x in contacts if isinstance(x[1], Gap)]
     links = {
         kind: tuple(
             Link(part.name, law, rows[part.a], rows[part.b]) for part, law, _ in parts
@@ -103,6 +109,7 @@ def compile_parts(
         has_gravity=gravity is not None,
         drives=links[AbstractDrive],
         inerters=links[AbstractInerter],
+        contacts=links[AbstractContact],
     )
     tables = dict(
         bodies=_tables(layout.body_groups, {b.name: b.numbers for b in bodies}),
@@ -113,6 +120,7 @@ def compile_parts(
             [group.links for group in layout.inerter_groups],
             _by_name(resolved[AbstractInerter]),
         ),
+        contacts=_tables(layout.contact_groups, _by_name(resolved[AbstractContact])),
     )
     return layout, Parameters(tables, _own(own, gravity, layout, tables), layout)
 

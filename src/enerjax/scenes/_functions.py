@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._run import Impact
 from .._system import Names, RigidBodies, System
 from .._types import Coordinates, Multipliers, Scalar, Velocities
-from ._laws import AbstractForceLaw, Acting, Driven
+from ._laws import AbstractForceLaw, Acting, Driven, Gap
 from ._layout import Layout, Links
 from ._motion_view import Moving
 from ._parameters import Parameters
@@ -39,7 +40,37 @@ def make_system(layout: Layout, over_constrained: bool, row_names: Sequence[str]
         redundant=over_constrained,
         rigid_bodies=layout.rigid_bodies,
         names=Names(q, v, row_names),
+        events=impacts(layout),
     )
+
+
+def impacts(layout: Layout) -> tuple[Impact, ...]:
+    """An impact for each contact with a restitution."""
+    found = []
+    for k, link in enumerate(layout.contacts):
+        assert isinstance(link.law, Gap)
+        elastic = link.law.is_elastic
+        restitution = 1.0 if elastic else eqx.Partial(_restitution, layout, k)
+        found.append(Impact(eqx.Partial(_gap, layout, k), restitution))
+    return tuple(found)
+
+
+def _contact(layout: Layout, k: int, args: Parameters) -> tuple[Links, dict[str, Array]]:
+    """A contact, and its numbers as tables with one row."""
+    name = layout.contacts[k].name
+    number, row = layout.places["contacts"][name]
+    group, only = layout.contact_groups[number], slice(row, row + 1)
+    table = {key: x[only] for key, x in args.tables["contacts"][number].items()}
+    return Links(group.law, (name,), group.a[only], group.b[only]), table
+
+
+def _gap(layout: Layout, k: int, q: Coordinates, args: Parameters) -> Scalar:
+    group, numbers = _contact(layout, k, args)
+    return evaluate(group, View(layout, q), numbers)[0]
+
+
+def _restitution(layout: Layout, k: int, args: Parameters) -> Scalar:
+    return _contact(layout, k, args)[1]["restitution"][0]
 
 
 def kinetic(layout: Layout, v: Velocities, args: Parameters) -> Scalar:
@@ -155,8 +186,8 @@ def force(
     view = Moving(layout, q, v, args)
     groups = [
         (group, at_time(group, numbers, t, args, view))
-        for group, numbers in zip(layout.force_groups, args.tables["forces"], strict=True)
-        if isinstance(group.law, AbstractForceLaw)
+        for group, numbers in zip(layout.push_groups, args.tables["forces"], strict=True)
+        if group is not None
     ]
 
     def measures(x: Coordinates) -> list[Array]:

@@ -21,12 +21,15 @@ from ._laws import (
     Acting,
     Driven,
     Flywheel,
+    Gap,
+    Penalized,
 )
 from ._layout import Layout, Links
 from ._measures import AbstractLaw
 from ._parameters import Parameters
 from ._part import AbstractForce
 from ._pose_view import evaluate, View
+from .contacts import AbstractContact
 from .joints import AbstractJoint
 
 
@@ -45,6 +48,8 @@ def resolved_part(part: Any, ends: Ends) -> tuple[AbstractLaw, Numbers]:
     elif isinstance(part, AbstractForce):
         kinds = _OF_FORCES
         names = "an `AbstractPotentialLaw`, `AbstractSpringLaw` or `AbstractForceLaw`"
+    elif isinstance(part, AbstractContact):
+        kinds, names = Gap | Penalized, "a `Gap` or `Penalized` law"
     elif isinstance(part, AbstractInerter):
         kinds, names = Flywheel, "a `Flywheel` law"
     if not isinstance(law, kinds):

@@ -104,9 +104,13 @@ class AbstractPotentialLaw(AbstractLaw):
 
 
 class AbstractSpringLaw(AbstractLaw):
-    """A potential energy of a measure; the force along the measure is minus its slope."""
+    """A potential energy of a measure; the force along the measure is minus its slope.
+
+    - `damper`: a force along the same measure that acts as well, if any.
+    """
 
     measure: AbstractMeasure
+    damper: "AbstractForceLaw | None" = None
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -214,6 +218,56 @@ class Viscous(AbstractForceLaw):
 
     def force(self, a: Frame, b: Frame, rate: Array, numbers: Numbers) -> Array:
         return -numbers["damping"] * rate
+
+
+@dataclass(frozen=True)
+class Gap(AbstractLaw):
+    """A gap that must not become negative, with an impact where it closes."""
+
+    measure: AbstractMeasure
+    is_elastic: bool
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return self.measure.reads
+
+    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Scalar:
+        return self.measure(a, b, numbers)
+
+
+def _compression(gap: Scalar, numbers: Numbers, exponent: Scalar) -> Scalar:
+    """A power of the penetration, zero where the gap is open."""
+    closed = gap < 0
+    # The inner choice keeps the derivative with respect to the exponent finite.
+    return jnp.where(closed, jnp.where(closed, -gap, 1.0) ** exponent, 0.0)
+
+
+@dataclass(frozen=True)
+class Penalized(AbstractSpringLaw):
+    """The energy of a spring that acts where a gap is negative, with a damper."""
+
+    measure: AbstractMeasure
+
+    @property
+    def damper(self) -> "AbstractForceLaw":
+        return CompressionDamper(self.measure)
+
+    def energy(self, value: Array, numbers: Numbers) -> Scalar:
+        exponent = numbers["exponent"] + 1
+        energy = _compression(value, numbers, exponent)
+        return numbers["stiffness"] * energy / exponent
+
+
+@dataclass(frozen=True)
+class CompressionDamper(AbstractForceLaw):
+    """The damper of Hunt and Crossley."""
+
+    measure: AbstractMeasure
+
+    def force(self, a: Frame, b: Frame, rate: Array, numbers: Numbers) -> Array:
+        gap = self.measure(a, b, numbers)
+        force = numbers["stiffness"] * _compression(gap, numbers, numbers["exponent"])
+        return -numbers["damping"] * force * rate
 
 
 @dataclass(frozen=True)

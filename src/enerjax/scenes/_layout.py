@@ -66,6 +66,7 @@ class Layout:
     has_gravity: bool
     drives: tuple[Link, ...] = ()
     inerters: tuple[Link, ...] = ()
+    contacts: tuple[Link, ...] = ()
 
     @cached_property
     def body_groups(self) -> tuple[Bodies, ...]:
@@ -105,6 +106,10 @@ class Layout:
         return _links(self.drives)
 
     @cached_property
+    def contact_groups(self) -> tuple[Links, ...]:
+        return _links(self.contacts)
+
+    @cached_property
     def inerter_groups(self) -> tuple[Inerters, ...]:
         place = {link.name: k for k, link in enumerate(self.inerters)}
         q = self.num_coordinates - len(place)
@@ -132,7 +137,20 @@ class Layout:
 
     @property
     def has_pushes(self) -> bool:
-        return any(isinstance(link.law, AbstractForceLaw) for link in self.forces)
+        return any(group is not None for group in self.push_groups)
+
+    @cached_property
+    def push_groups(self) -> tuple[Links | None, ...]:
+        """The force groups with the laws of their forces; `None` for those with a potential
+        alone."""
+
+        def pushing(group: Links) -> Links | None:
+            if isinstance(group.law, AbstractForceLaw):
+                return group
+            damper = getattr(group.law, "damper", None)
+            return None if damper is None else group._replace(law=damper)
+
+        return tuple(pushing(group) for group in self.force_groups)
 
     @cached_property
     def places(self) -> dict[str, dict[str, tuple[int, int]]]:
@@ -143,6 +161,7 @@ class Layout:
             forces=self.force_groups,
             drives=self.drive_groups,
             inerters=[group.links for group in self.inerter_groups],
+            contacts=self.contact_groups,
         )
         return {
             section: {

@@ -75,6 +75,28 @@ class Slide(AbstractMeasure):
 
 
 @dataclass(frozen=True)
+class Height(AbstractMeasure):
+    """The height of a sphere of the second body over a plane of the first."""
+
+    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Scalar:
+        height = jnp.sum(offset(a, b, numbers) * a.direction(numbers["normal"]))
+        return height - numbers["radius"]
+
+
+@dataclass(frozen=True)
+class Clearance(AbstractMeasure):
+    """The gap between two spheres, of which the second may be `inside` of the first."""
+
+    inside: bool
+
+    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Scalar:
+        apart = Separation()(a, b, numbers)
+        if self.inside:
+            return numbers["radius_a"] - numbers["radius_b"] - apart
+        return apart - numbers["radius_a"] - numbers["radius_b"]
+
+
+@dataclass(frozen=True)
 class Place(AbstractMeasure):
     """The position of a point of the second body."""
 
@@ -136,6 +158,23 @@ class Turn(AbstractTurn):
         x, y = (a.direction(numbers["frame_a"][k]) for k in (0, 1))
         turned = b.direction(numbers["frame_b"][0])
         return jnp.sum(turned * x), jnp.sum(turned * y)
+
+
+@dataclass(frozen=True)
+class Room(AbstractMeasure):
+    """What is left to another measure before it reaches a limit, from above if `lower`."""
+
+    measure: AbstractMeasure
+    lower: bool
+
+    # An angle counts as a length here: it needs no full turns, and is drawn as a contact.
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return self.measure.reads
+
+    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Scalar:
+        room = numbers["limit"] - self.measure(a, b, numbers)
+        return -room if self.lower else room
 
 
 def turn_of(ends: Ends, axis: Vector | None) -> tuple[AbstractMeasure, Numbers]:

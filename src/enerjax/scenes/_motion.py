@@ -205,7 +205,7 @@ def motion_of(
             *places(section, link),
             symbol_of(link.law),
         )
-        for section in ("joints", "forces", "drives")
+        for section in ("joints", "forces", "drives", "contacts")
         for link in getattr(layout, section)
     )
     _check_closed(links, frames)

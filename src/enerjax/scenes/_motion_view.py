@@ -14,6 +14,7 @@ from ._laws import (
     AbstractSpringLaw,
     Driven,
     Flywheel,
+    Gap,
 )
 from ._layout import Layout, Links
 from ._measures import AbstractMeasure
@@ -98,13 +99,21 @@ def measure_of(layout: Layout, name: str) -> AbstractMeasure:
 def measures_of(layout: Layout) -> dict[str, AbstractMeasure]:
     """The measures of all parts that have one."""
     found = {}
-    for link in (*layout.joints, *layout.forces, *layout.drives, *layout.inerters):
+    for link in (
+        *layout.joints,
+        *layout.forces,
+        *layout.drives,
+        *layout.inerters,
+        *layout.contacts,
+    ):
         if isinstance(link.law, _MEASURED) and link.law.measure is not None:
             found[link.name] = link.law.measure
     return found
 
 
-_MEASURED = AbstractConstraintLaw | AbstractSpringLaw | AbstractForceLaw | Driven | Flywheel
+_MEASURED = (
+    AbstractConstraintLaw | AbstractSpringLaw | AbstractForceLaw | Driven | Flywheel | Gap
+)
 
 
 def link_of(layout: Layout, name: str, args: Parameters) -> tuple[Links, Numbers]:
@@ -114,6 +123,7 @@ def link_of(layout: Layout, name: str, args: Parameters) -> tuple[Links, Numbers
         forces=layout.force_groups,
         drives=layout.drive_groups,
         inerters=[group.links for group in layout.inerter_groups],
+        contacts=layout.contact_groups,
     )
     section = next(key for key in groups if name in layout.places[key])
     number, row = layout.places[section][name]

@@ -8,7 +8,9 @@ from ._laws import (
     AbstractSpringLaw,
     Alignment,
     Driven,
+    Gap,
     Length,
+    Penalized,
     Steady,
     Viscous,
 )
@@ -18,7 +20,7 @@ from ._measures import AbstractLaw
 # - "pin": holds two points together: a hinge with an axis, two axes or, as a ball, none.
 # - "slider": lets a point slide along its axis; "plane": along the plane to which its axis
 #   is normal; "weld": holds bodies together; "rod": keeps a distance; "contact": any other
-#   constraint.
+#   constraint, and gaps.
 # - "spring", "damper", "actuator": between two points.
 # - "torsion spring", "torsion damper", "motor": about a hinge.
 # - "load": acts on a point, or moves it; "field": any other force.
@@ -31,6 +33,8 @@ Symbol: TypeAlias = Literal[
 def symbol_of(law: AbstractLaw) -> Symbol:
     if isinstance(law, AbstractConstraintLaw):
         return _symbol_of_joint(law)
+    if isinstance(law, Gap | Penalized):
+        return "contact"
     measure = getattr(law, "measure", None)
     if measure is None:
         return "field"
