@@ -197,6 +197,31 @@ def test_times_of_events_have_the_order_of_the_scheme(scheme, order):
     assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.4)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "scheme",
+    [
+        ej.EnergyDecaying(0.5),
+        ej.EnergyConsistent(0.0),
+        ej.EnergyConsistent(0.5),
+        ej.KappaDecaying(0.5),
+        ej.Rattle(),
+        ej.Composed(ej.Rattle(), 4),
+        ej.Composed(ej.EnergyConsistent(0.0), 6),
+    ],
+    ids=repr,
+)
+def test_all_schemes_of_any_length_end_steps_at_events(scheme):
+    sol = swinging(0.01, 0.7, 300, scheme, max_events=4)
+    assert int(sol.events.count) == 2
+    # By quadrature 0.8249384; the errors are those of the schemes.
+    assert abs(sol.events.ts[0] - 0.8249384) < 2e-4
+    np.testing.assert_allclose(sol.events.before.q[:2, 0], WALL, rtol=1e-14)
+    assert np.abs(sol.audit.leak).max() < 1e-13  # round-off
+    speeds = [np.linalg.norm(x.v[0]) for x in (sol.events.before, sol.events.after)]
+    np.testing.assert_allclose(speeds[1], 0.7 * speeds[0], rtol=1e-12)
+
+
 # What events do --------------------------------------------------------------------------
 
 
