@@ -197,7 +197,7 @@ def test_reverse_derivatives_and_batches(sleigh):
 def test_an_elastic_impact_respects_the_knife_edge():
     wall = ej.Impact(lambda q, args: 1.0 - q[0], 1.0)
     start = sleigh_at(1.5, 0.2)
-    sol = ej.simulate(
+    sol: Any = ej.simulate(
         SLEIGH, PRESERVING, start, ARGS, h=0.05, num_steps=40, events=wall, max_events=5
     )
     assert sol.events.count >= 1
