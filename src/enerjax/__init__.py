@@ -4,6 +4,7 @@ from . import problems as problems
 from ._analysis import (
     consistent_start as consistent_start,
     ConsistentStart as ConsistentStart,
+    eigenvalues as eigenvalues,
     Equilibrium as Equilibrium,
     equilibrium as equilibrium,
     initial_state as initial_state,

@@ -1,3 +1,4 @@
+from .eigenvalues import eigenvalues as eigenvalues
 from .equilibrium import Equilibrium as Equilibrium, equilibrium as equilibrium
 from .initial import (
     consistent_start as consistent_start,

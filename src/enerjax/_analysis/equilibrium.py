@@ -67,8 +67,15 @@ def equilibrium(
 
     **Raises:** `ValueError` if no equilibrium is found (under `jit`, `vmap` and `grad`
     `equinox.EquinoxRuntimeError`); `ValueError` and `TypeError` for bad input, and for a
-    `System.from_hamiltonian`, whose momenta need not vanish in equilibrium.
+    `System.from_hamiltonian`, whose momenta need not vanish in equilibrium, and for
+    `nonholonomic` constraints, with which equilibria are not isolated.
     """
+    if system.nonholonomic is not None:
+        raise ValueError(
+            "`equilibrium`: a system with `nonholonomic` constraints has a family of "
+            "equilibria, because friction holds it in each place. Leave these constraints "
+            "out, and give constraints on positions instead where it must not move."
+        )
     rest, args = at_rest(system, guess, args, t)
     found, residual, ok = _solve(system, rest, args, root_finder)
     message = (

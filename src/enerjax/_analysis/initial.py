@@ -29,18 +29,21 @@ class ConsistentStart(eqx.Module):
 
     - `state`: the projected `State`.
     - `accelerations`: `vdot`, shape `(nv,)`.
-    - `multipliers`: `lambda`, shape `(nc,)`, of joints, driven constraints and relations
-      between coordinates, in this order (energy per constraint unit).
-    - `constraint_before`, `constraint_after`: residuals at position level, `(nc,)`.
-    - `rate_before`, `rate_after`: residuals of the joints at velocity level, `(nj,)`,
-      before and after the projection of `v`; both at the projected `q`.
+    - `multipliers`: `lambda`, shape `(nc,)`, of joints, driven constraints, nonholonomic
+      constraints and relations between coordinates, in this order (energy per constraint
+      unit).
+    - `constraint_before`, `constraint_after`: residuals at position level, of all but the
+      nonholonomic constraints.
+    - `rate_before`, `rate_after`: residuals at velocity level, `(nj,)`, of joints, driven
+      and nonholonomic constraints, before and after the projection of `v`; both at the
+      projected `q`.
     """
 
     state: State
     accelerations: Velocities
     multipliers: Multipliers
-    constraint_before: Multipliers
-    constraint_after: Multipliers
+    constraint_before: Float[Array, " nh"]
+    constraint_after: Float[Array, " nh"]
     rate_before: Float[Array, " nj"]
     rate_after: Float[Array, " nj"]
 
@@ -79,10 +82,10 @@ def consistent_start(
     """Projects a start onto the constraints, and finds its accelerations and multipliers.
 
     First `q` is moved to the nearest point with `Phi(q) = 0` in the metric of the inertia
-    (Euclidean along redundant coordinates), then `v` to the nearest with `dPhi/dt = 0`;
-    accelerations and multipliers follow from the equations of motion. All of them are
-    differentiable with respect to `q`, `v` and `args`, so derivatives of a run with
-    respect to its start are taken along the constraints.
+    (Euclidean along redundant coordinates), then `v` to the nearest with `dPhi/dt = 0` and
+    `A qdot = 0`; accelerations and multipliers follow from the equations of motion. All of
+    them are differentiable with respect to `q`, `v` and `args`, so derivatives of a run
+    with respect to its start are taken along the constraints.
 
     **Arguments:**
 
@@ -182,7 +185,8 @@ def _is_consistent(system: AbstractSystem, state: State, args: Args) -> Flag:
     inner = model.to_internal(state)
     q, t, scales = inner.q, inner.t, model.scales
     eps = jnp.finfo(q.dtype).eps
-    position = jnp.abs(model.constraint(q, t)) <= 2 * eps * scales.constraint_size
+    terms = model.holonomic(scales.constraint_size)
+    position = jnp.abs(model.constraint(q, t)) <= 2 * eps * terms
     rate = model.joint_rate(q, inner.v, t)
     speed = jnp.sqrt(2 * model.kinetic(inner))
     slow = jnp.abs(rate) <= 2 * eps * speed * scales.constraint[: rate.size]

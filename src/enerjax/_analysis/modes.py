@@ -59,14 +59,20 @@ def modes(
     constraints are redundant the system must be declared with `redundant=True`, and the
     pose must be known: such a call cannot be inside `jit` and `vmap`.
 
-    **Raises:** `ValueError` and `TypeError` for bad input, and for a system with a `force`,
-    whose modes need not be vibrations. If values are known, also for a pose in which forces
+    **Raises:** `ValueError` and `TypeError` for bad input, and for a system with a `force`
+    or `nonholonomic` constraints, whose modes need not be vibrations: `eigenvalues` finds
+    those of the linearised equations. If values are known, also for a pose in which forces
     are out of balance, and for redundant constraints that are not declared.
     """
     if system.force is not None:
         raise ValueError(
             "`modes` are free vibrations without damping, and this system has a `force`. "
             "Leave it out, or give its potential."
+        )
+    if system.nonholonomic is not None:
+        raise ValueError(
+            "`modes` are vibrations of systems with holonomic constraints, and this one is "
+            "`nonholonomic`. `eigenvalues` finds those of its linearised equations."
         )
     rest, args = at_rest(system, state, args, t)
     kept = _independent(system, rest, args) if system.redundant else None

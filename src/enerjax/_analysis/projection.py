@@ -28,7 +28,7 @@ _LARGE = 500
 def rank_of_constraints(model: AbstractModel, state: State) -> Count:
     """The rank of the constraint Jacobian; of a large one, only whether it is full."""
     q, scales = state.q, model.scales
-    constraint = lambda q: model.constraint(q, state.t)
+    constraint = model.constraint_near(q, state.t)
     num_constraints = scales.constraint.size
     if num_constraints == 0:
         return jnp.array(0)
@@ -66,8 +66,9 @@ class _Conditions(eqx.Module):
     def scales(self) -> tuple[Array, Array]:
         """The counterparts of `constraint` and `constraint_size` of `Scales`."""
         scales, known = self.model.scales, jnp.asarray(self.known, int)
-        unit = jnp.concatenate([scales.constraint, 1 / scales.coordinate[known]])
-        return unit, jnp.concatenate([scales.constraint_size, jnp.abs(self.guess[known])])
+        unit, size = map(self.model.holonomic, (scales.constraint, scales.constraint_size))
+        unit = jnp.concatenate([unit, 1 / scales.coordinate[known]])
+        return unit, jnp.concatenate([size, jnp.abs(self.guess[known])])
 
 
 def project_position(
@@ -75,7 +76,7 @@ def project_position(
 ) -> tuple[Coordinates, Flag]:
     """The nearest configuration on the constraints, and whether it could be found."""
     guess = state.q
-    if model.scales.constraint.size == 0:
+    if model.holonomic(model.scales.constraint).size == 0:
         return guess, jnp.array(True)
     metric, coordinate = model.metric(model.to_internal(state)), model.scales.coordinate
     size = largest(guess * coordinate)
@@ -145,11 +146,12 @@ def project_velocity(
     """The nearest velocities (or momenta) that the joints admit, and whether these keep
     the known entries; of momenta, whether Newton's method found them."""
     q, v, t = state.q, state.v, state.t
-    if model.joint(q, t).size == 0:
+    rates = lambda x: model.joint_rate(q, x, t)
+    num_rates = jax.eval_shape(rates, v).size
+    if num_rates == 0:
         return v, jnp.array(True)
     eps = jnp.finfo(v.dtype).eps
-    unit = model.scales.constraint[: model.joint(q, t).size]
-    rates = lambda x: model.joint_rate(q, x, t)
+    unit = model.scales.constraint[:num_rates]
 
     def correct(
         v: Velocities, conditions: Conditions, unit: Array, regularisation: Array | None

@@ -11,6 +11,15 @@ gradient of
 
     H + lambda . Phi(q) + eta . psi(q, mu),      psi = dPhi/dt
 
+Nonholonomic constraints `A(q) qdot = 0` have terms `eta . A(q) qdot` in `psi`. There is no
+function whose gradient is their force, so it is `A(q_m)^T lambda` over the whole interval.
+It does no work, and energy is conserved, because the step satisfies
+
+    A(q_m) (q_b - q_a) = 0
+
+beside `A(q_b) qdot_b = 0`. For `A = dPhi/dq` this is the step of a joint, except that the
+matrix in the middle takes the place of the discrete gradient of `Phi`.
+
 Forces `f` add `-h Lm^T f` to the first row. For driven constraints, `Phi(q, t)`, the
 discrete gradient is taken with respect to `q` and `t` jointly, and its `t` component is the
 power that they supply.
@@ -265,8 +274,52 @@ class AbstractModel(eqx.Module):
         """The multipliers `lambda` of `accelerations`."""
 
     @abc.abstractmethod
-    def constraint(self, q: Coordinates, t: Time) -> Multipliers:
+    def coordinate(self, q: Coordinates) -> Float[Array, " ncc"]:
+        """The coordinate constraints, which relate redundant coordinates of a body."""
+
+    @abc.abstractmethod
+    def constraint(self, q: Coordinates, t: Time) -> Float[Array, " nh"]:
         """`Phi(q, t)`: the joints, followed by the coordinate constraints."""
+
+    def nonholonomic(self, q: Coordinates) -> Float[Array, "k nq"]:
+        """The matrix `A(q)`."""
+        if self.system.nonholonomic is None:
+            return jnp.zeros((0, q.size), q.dtype)
+        return self.system.nonholonomic(q, self.args)
+
+    def joint_near(
+        self, at: Coordinates, t: Time
+    ) -> Callable[[Coordinates], JointMultipliers]:
+        """The joints near a position, with `A(at) (q - at)` for nonholonomic constraints.
+
+        The derivatives at this position are the rows of the constraint Jacobian.
+        """
+        if self.system.nonholonomic is None:
+            return lambda q: self.joint(q, t)
+        matrix = self.nonholonomic(at)
+        return lambda q: jnp.concatenate([self.joint(q, t), matrix @ (q - at)])
+
+    def constraint_near(
+        self, at: Coordinates, t: Time
+    ) -> Callable[[Coordinates], Multipliers]:
+        """`joint_near`, followed by the coordinate constraints."""
+        if self.system.nonholonomic is None:
+            return lambda q: self.constraint(q, t)
+        joint = self.joint_near(at, t)
+        return lambda q: jnp.concatenate([joint(q), self.coordinate(q)])
+
+    def holonomic(self, rows: Multipliers) -> Float[Array, " nh"]:
+        """The entries of holonomic constraints; `rows` has one for each multiplier."""
+        if self.system.nonholonomic is None:
+            return rows
+        first, last = self._nonholonomic_range(self.scales.coordinate)
+        return jnp.concatenate([rows[:first], rows[last:]])
+
+    def _nonholonomic_range(self, q: Coordinates) -> tuple[int, int]:
+        """The range of the nonholonomic constraints among the multipliers."""
+        t = jnp.zeros((), q.dtype) if self.system.is_timed else None
+        first = jax.eval_shape(lambda q: self.joint(q, t), q).size
+        return first, first + jax.eval_shape(lambda q: self.nonholonomic(q), q).shape[0]
 
     def stiffness_product(
         self, state: State, multipliers: Multipliers, along: tuple[Coordinates, Time]
@@ -280,7 +333,7 @@ class AbstractModel(eqx.Module):
         self, q: Coordinates, t: Time, multipliers: Multipliers
     ) -> Coordinates:
         """`B(q, t)^T multipliers`, shape `(nq,)`."""
-        _, transpose = jax.vjp(lambda q: self.constraint(q, t), q)
+        _, transpose = jax.vjp(self.constraint_near(q, t), q)
         return transpose(multipliers)[0]
 
     @abc.abstractmethod
@@ -311,8 +364,12 @@ class AbstractModel(eqx.Module):
         return jnp.concatenate([self.fixed(q), self.driven(q, t)])
 
     def joint_rate(self, q: Coordinates, v: Velocities, t: Time) -> JointMultipliers:
-        """`psi(q, v, t) = dPhi/dt` of the joints."""
-        return jax.jvp(self.joint, (q, t), (self.lift(q, v), time_rate(t)))[1]
+        """`psi(q, v, t)`: `dPhi/dt` of the joints, and `A(q) qdot`."""
+        rates = self.lift(q, v)
+        rows = jax.jvp(self.joint, (q, t), (rates, time_rate(t)))[1]
+        if self.system.nonholonomic is None:
+            return rows
+        return jnp.concatenate([rows, self.nonholonomic(q) @ rates])
 
     def symmetry_momenta(self, state: State) -> Float[Array, " ns"]:
         """The momentum maps of the symmetries that the user has declared."""
@@ -320,22 +377,45 @@ class AbstractModel(eqx.Module):
         none = jnp.zeros((0,), state.q.dtype)
         return symmetry(state.q, self.args) @ self.momentum(state) if symmetry else none
 
-    def split(self, increment: Increment, q: Coordinates) -> tuple[Increment, Increment]:
-        """Two increments: one with the multipliers of the time-independent constraints
-        only, and one with those of the driven constraints only; `q` is any position."""
-        if self.system.driven is None:
-            return increment, increment
-        t = jnp.zeros((), q.dtype)
+    def split(
+        self, increment: Increment, q: Coordinates
+    ) -> tuple[Increment, Increment, Increment]:
+        """Three increments, each with the multipliers of some constraints only: of the
+        holonomic ones that do not depend on time, of the driven ones, and of the
+        nonholonomic ones; `q` is any position."""
+        if self.system.driven is None and self.system.nonholonomic is None:
+            return increment, increment, increment
         first = jax.eval_shape(self.fixed, q).size
-        last = first + jax.eval_shape(self.driven, q, t).size
+        middle, last = self._nonholonomic_range(q)
 
-        def parts(x: Array) -> tuple[Array, Array]:
-            return jnp.concatenate([x[:first], x[last:]]), x[first:last]
+        def parts(x: Array) -> tuple[Array, Array, Array]:
+            fixed = jnp.concatenate([x[:first], x[last:]])
+            return fixed, x[first:middle], x[middle:last]
 
         multipliers = lambda z: (z.impulse, z.velocity_impulse)
-        fixed, driven = zip(*map(parts, multipliers(increment)), strict=True)
-        with_those = lambda some: eqx.tree_at(multipliers, increment, some)
-        return with_those(fixed), with_those(driven)
+        those = zip(*map(parts, multipliers(increment)), strict=True)
+        fixed, driven, nonholonomic = (
+            eqx.tree_at(multipliers, increment, some) for some in those
+        )
+        return fixed, driven, nonholonomic
+
+    def slip(
+        self, qa: Coordinates, qb: Coordinates, displacement: Coordinates
+    ) -> Float[Array, " k"]:
+        """`A(q_m) displacement`, which nonholonomic constraints forbid over `a -> b`."""
+        return self.nonholonomic(0.5 * (qa + qb)) @ displacement
+
+    def nonholonomic_impulse(
+        self, gradient: Coordinates, a: State, b: State, increment: Increment
+    ) -> Coordinates:
+        """A gradient plus `A(q_m)^T impulse`; `increment` has only these multipliers."""
+        if self.system.nonholonomic is None:
+            return gradient
+        return gradient + increment.impulse @ self.nonholonomic(0.5 * (a.q + b.q))
+
+    def has_slip_rate(self, increment: Increment) -> bool:
+        """Whether nonholonomic constraints have multipliers at velocity level."""
+        return self.system.nonholonomic is not None and increment.velocity_impulse.size > 0
 
     def driven_action(
         self, q: Coordinates, rate: Coordinates, t: Time, h: Scalar, driven: Increment
@@ -385,7 +465,8 @@ class AbstractModel(eqx.Module):
             q, t = state.q, state.t
             assert t is not None
             moved = (self.constraint(q, t + h) - self.constraint(q, t)) / h
-            size = jnp.maximum(size, jnp.sum((moved / self.scales.constraint) ** 2))
+            unit = self.holonomic(self.scales.constraint)
+            size = jnp.maximum(size, jnp.sum((moved / unit) ** 2))
         return jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
 
     def force_size(self, state: State) -> Increments:
@@ -425,7 +506,7 @@ class AbstractModel(eqx.Module):
         q = state.q
         step = self.step_scale(state)
         coordinate = self.coordinate_scale(step)
-        rows = lambda q: self.constraint(q, state.t)
+        rows = self.constraint_near(q, state.t)
         pattern = RowPattern(rows, q)
         entries, columns = pattern.derivative(rows, q), pattern.columns
         # A bound on the size of the terms. The terms themselves may be zero at the start,
@@ -433,6 +514,10 @@ class AbstractModel(eqx.Module):
         length = lambda rows: jnp.sqrt(jnp.sum(rows**2, axis=1))
         constraint = length(entries / coordinate[columns])
         size = constraint * length(pattern.own(coordinate * q))
+        if self.system.nonholonomic is not None:
+            # They have no terms in the position.
+            first, last = self._nonholonomic_range(q)
+            size = size.at[first:last].set(0)
         # A zero gradient makes the step equations singular, which is reported as a failure.
         # The scaling must not divide by zero before that.
         constraint = jnp.where(constraint > 0, constraint, 1.0)

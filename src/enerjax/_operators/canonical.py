@@ -60,6 +60,9 @@ class CanonicalModel(AbstractModel):
     def potential(self, state: State) -> Scalar:
         return self.system.potential_energy(state, self.args)
 
+    def coordinate(self, q: Coordinates) -> Float[Array, " ncc"]:
+        return q[:0]
+
     def constraint(self, q: Coordinates, t: Time) -> Multipliers:
         return self.joint(q, t)
 
@@ -140,12 +143,16 @@ class CanonicalModel(AbstractModel):
         is_step: bool,
     ) -> Gradient:
         size = a.q.size
-        fixed, driven = self.split(increment, a.q)
+        fixed, driven, nonholonomic = self.split(increment, a.q)
+        has_slip_rate = self.has_slip_rate(nonholonomic)
 
         def action(z: Float[Array, " nz"]) -> Scalar:
             q, p = z[:size], z[size:]
             energy, rate = self.system.hamiltonian_and_rate(q, p, self.args)
             out = h * energy
+            if has_slip_rate:
+                slip_rate = self.nonholonomic(q) @ rate
+                out = out + h * nonholonomic.velocity_impulse @ slip_rate
             if fixed.velocity_impulse.size > 0:
                 constraint, psi = jax.jvp(self.fixed, (q,), (rate,))
                 return out + fixed.impulse @ constraint + h * fixed.velocity_impulse @ psi
@@ -171,7 +178,8 @@ class CanonicalModel(AbstractModel):
             weights,
             terms,
         )
-        return Gradient(both[:size], both[size:] / h, work)
+        impulse = self.nonholonomic_impulse(both[:size], a, b, nonholonomic)
+        return Gradient(impulse, both[size:] / h, work)
 
     def structure(
         self, a: State, b: State, h: Scalar, rate: Coordinates, gradient: Gradient
@@ -205,7 +213,8 @@ class CanonicalModel(AbstractModel):
 
     def augmented_energy(self, state: State, multipliers: Multipliers) -> Scalar:
         constraint = self.constraint(state.q, state.t)
-        return self.hamiltonian(state.q, state.v) + multipliers @ constraint
+        energy = self.hamiltonian(state.q, state.v)
+        return energy + self.holonomic(multipliers) @ constraint
 
     def skew_gradient(
         self,
@@ -237,7 +246,7 @@ class CanonicalModel(AbstractModel):
         slope, rate = jax.grad(self.hamiltonian, argnums=(0, 1))(q, p)
         if self.system.force is not None:
             slope = slope - self.force(q, rate, t)
-        jacobian = jax.jacfwd(self.constraint)(q, t)
+        jacobian = jax.jacfwd(self.constraint_near(q, t))(q)
         if jacobian.shape[0] == 0:
             return -slope, jnp.zeros((0,), q.dtype)
         rates = jax.jacfwd(self.joint_rate, argnums=1)(q, p, t)

@@ -163,7 +163,6 @@ class SeparableModel(AbstractModel):
         return Gradient(h * jax.grad(self._potential)(state.q), jnp.zeros((0,), h.dtype))
 
     def coordinate(self, q: Coordinates) -> Float[Array, " ncc"]:
-        """The coordinate constraints, which relate redundant coordinates of a body."""
         if self.system.coordinate_constraint is None:
             return jnp.zeros((0,), q.dtype)
         return self.system.coordinate_constraint(q, self.args)
@@ -233,11 +232,13 @@ class SeparableModel(AbstractModel):
         *,
         is_step: bool,
     ) -> Gradient:
-        fixed, driven = self.split(increment, a.q)
+        fixed, driven, nonholonomic = self.split(increment, a.q)
         mean_rate, torque = self._mean_rates(a, b, h, increment, is_step)
 
         constraint = lambda q: jnp.concatenate([self.fixed(q), self.coordinate(q)])
         rate = lambda q: jax.jvp(self.fixed, (q,), (mean_rate(q),))[1]
+        slip_rate = lambda q: self.nonholonomic(q) @ mean_rate(q)
+        has_slip_rate = self.has_slip_rate(nonholonomic)
 
         def action(q: Coordinates) -> Scalar:
             out = h * self._potential(q)
@@ -245,6 +246,8 @@ class SeparableModel(AbstractModel):
                 out = out + fixed.impulse @ constraint(q)
             if fixed.velocity_impulse.size > 0:
                 out = out + h * fixed.velocity_impulse @ rate(q)
+            if has_slip_rate:
+                out = out + h * nonholonomic.velocity_impulse @ slip_rate(q)
             return out
 
         def driven_action(q: Coordinates, t: Time) -> Scalar:
@@ -258,14 +261,18 @@ class SeparableModel(AbstractModel):
             impulse, work = gradient_and_work(
                 derivative, action, with_time, *ends, size=size
             )
+            impulse = self.nonholonomic_impulse(impulse, a, b, nonholonomic)
             return Gradient(impulse, none, work, torque)
         rows: list[Summands] = [lambda q, fn=fn: h * fn(q) for fn in energies]
         rows += [lambda q: fixed.impulse * constraint(q)]
         if fixed.velocity_impulse.size > 0:
             rows += [lambda q: h * fixed.velocity_impulse * rate(q)]
+        if has_slip_rate:
+            rows += [lambda q: h * nonholonomic.velocity_impulse * slip_rate(q)]
         impulse, work = gradient_and_work_by_rows(derivative, rows, with_time, *ends)
         if self.has_linear_potential:
             impulse = impulse + h * jax.grad(self._potential)(a.q)
+        impulse = self.nonholonomic_impulse(impulse, a, b, nonholonomic)
         return Gradient(impulse, none, work, torque)
 
     def structure(
@@ -317,7 +324,7 @@ class SeparableModel(AbstractModel):
         """`B^T eta` of the joints: the gradient of `eta . psi` with respect to the rates
         of the coordinates."""
         q, t = position
-        _, transpose = jax.vjp(lambda q: self.joint(q, t), q)
+        _, transpose = jax.vjp(self.joint_near(q, t), q)
         return q, transpose(eta)[0]
 
     def _lowered(self, q: Coordinates, force: Coordinates) -> Velocities:
@@ -334,7 +341,7 @@ class SeparableModel(AbstractModel):
 
     def joint_change(self, q: Coordinates, v: Velocities, t: Time) -> JointMultipliers:
         """`C(q, t) v`, the part of `psi` that is linear in `v`."""
-        return jax.jvp(lambda q: self.joint(q, t), (q,), (self.lift(q, v),))[1]
+        return jax.jvp(self.joint_near(q, t), (q,), (self.lift(q, v),))[1]
 
     def metric(self, state: State) -> Symmetric:
         return self.kinematics.metric(state.q, self.inertia, self.coordinate, self.args)
@@ -373,7 +380,8 @@ class SeparableModel(AbstractModel):
         return element_energies(self.system, q, self.args)
 
     def augmented_energy(self, state: State, multipliers: Multipliers) -> Scalar:
-        return self._potential(state.q) + multipliers @ self.constraint(state.q, state.t)
+        holonomic = self.holonomic(multipliers)
+        return self._potential(state.q) + holonomic @ self.constraint(state.q, state.t)
 
     def skew_gradient(
         self,
@@ -410,7 +418,7 @@ class SeparableModel(AbstractModel):
         """The rates of the joints, as a linear function of velocities and of the rates of
         the coordinate constraints."""
         rates = lambda v: self.lift(q, v) if frames is None else frames.rates(v)
-        return lambda v: jax.jvp(lambda q: self.joint(q, t), (q,), (rates(v),))[1]
+        return lambda v: jax.jvp(self.joint_near(q, t), (q,), (rates(v),))[1]
 
     def _weight(self) -> Symmetric:
         """The inverse inertia, with zeros for the rates of the coordinate constraints."""
@@ -469,7 +477,7 @@ class SeparableModel(AbstractModel):
         is_plain = self.has_canonical_rates and isinstance(inverse_inertia, Array)
         if not is_plain or self.system.redundant:
             return self.accelerations(state)[1]
-        rows = jax.jacfwd(self.constraint)(state.q, state.t)
+        rows = jax.jacfwd(self.constraint_near(state.q, state.t))(state.q)
         rows = rows / self.scales.constraint[:, None]
         free = inverse_inertia @ self.slope(state)
         right = self._free_joint_acceleration(state, state.v) / self.scales.constraint

@@ -35,10 +35,10 @@ class Audit(eqx.Module):
       schemes without an energy identity. If it is far above round-off, do not trust the
       run.
     - `momentum`: shape `(times, ns)`, of each `symmetry` of the system.
-    - `constraint`: shape `(times, nc)`, residuals of joints, driven constraints and
+    - `constraint`: shape `(times, nh)`, residuals of joints, driven constraints and
       relations between coordinates, each in its own unit.
-    - `constraint_rate`: shape `(times, nj)`, residuals of joints and driven constraints
-      at velocity level.
+    - `constraint_rate`: shape `(times, nj)`, residuals of joints, driven and nonholonomic
+      constraints at velocity level.
     """
 
     kinetic: Float[Array, " times"]
@@ -49,7 +49,7 @@ class Audit(eqx.Module):
     drive_work: Float[Array, " times"]
     impact: Float[Array, " times"]
     momentum: Float[Array, "times ns"]
-    constraint: Float[Array, "times nc"]
+    constraint: Float[Array, "times nh"]
     constraint_rate: Float[Array, "times nj"]
 
     @property
@@ -71,7 +71,7 @@ class Measures(eqx.Module):
     kinetic: Scalar
     potential: Scalar
     momentum: Float[Array, " ns"]
-    constraint: Float[Array, " nc"]
+    constraint: Float[Array, " nh"]
     constraint_rate: Float[Array, " nj"]
 
 

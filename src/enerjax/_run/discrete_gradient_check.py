@@ -84,6 +84,8 @@ def _functions(
         found.append(("constraint", system.constraint, (state.q, args)))
     if system.driven is not None:
         found.append(("driven", system.driven, (state.q, state.t, args)))
+    if system.nonholonomic is not None:
+        found.append(("nonholonomic", system.nonholonomic, (state.q, args)))
     return found
 
 

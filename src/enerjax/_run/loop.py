@@ -358,8 +358,9 @@ def _check_start(
     # NaN compares false: such a start fails in its first step.
     tolerance = 1e2 * jnp.sqrt(eps) * root
     position = jnp.abs(model.constraint(start.q, start.t))
-    rounding = 1e3 * eps * scales.constraint_size
-    bad = jnp.any(position > h * tolerance * scales.constraint + rounding)
+    unit, terms = map(model.holonomic, (scales.constraint, scales.constraint_size))
+    rounding = 1e3 * eps * terms
+    bad = jnp.any(position > h * tolerance * unit + rounding)
     if scheme.stage.formulation == "ggl":
         rate = jnp.abs(model.joint_rate(start.q, start.v, start.t))
         bad = bad | jnp.any(rate > tolerance * scales.constraint[: rate.size])

@@ -310,6 +310,5 @@ def free_flight(
     scheme: AbstractOneSolveScheme, problem: Any, model: AbstractModel, start: State
 ) -> PyTree[Any]:
     """The unknowns of a step without forces and multipliers."""
-    num_constraints = jax.eval_shape(model.constraint, start.q, start.t).shape[0]
-    no_force = jnp.zeros((num_constraints,), start.q.dtype)
+    no_force = jnp.zeros((model.scales.constraint.size,), start.q.dtype)
     return scheme.predict(problem, jnp.zeros_like(start.v), no_force)

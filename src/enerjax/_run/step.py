@@ -40,8 +40,8 @@ class StepOutput(eqx.Module):
     """One step, done or failed.
 
     - `state`: at the end of the step; meaningless if the step failed.
-    - `multipliers`: `lambda` of the step, `(nc,)`, of joints, driven constraints and
-      relations between coordinates, in this order.
+    - `multipliers`: `lambda` of the step, `(nc,)`, of joints, driven constraints,
+      nonholonomic constraints and relations between coordinates, in this order.
     - `energies`: the energy that the scheme removed, and the work of `force` and `driven`
       constraints.
     - `details`: what only this scheme reports, or `None`.

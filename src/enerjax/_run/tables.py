@@ -38,7 +38,7 @@ def table(solution: Solution, columns: Mapping[str, ArrayLike] | None) -> Column
                 f"The column `{name}` has the shape {x.shape}, and the run has "
                 f"{solution.ts.size} rows: the first axis must be that of the rows."
             )
-    flat = _flat(found, labels | dict(multiplier=labels["constraint"]))
+    flat = _flat(found, labels)
     return {name: reached(x) for name, x in flat}
 
 
@@ -47,9 +47,13 @@ def _labels(solution: Solution) -> dict[str, list[str]]:
     names, audit = solution.names or Names(), solution.audit
     number = lambda kind, x: [f"{kind}{k}" for k in range(x.shape[-1])]
     rows = list(names.constraints or number("", solution.multipliers))
+    num_rates = audit.constraint_rate.shape[-1]
+    # Nonholonomic constraints have rates only; relations between coordinates follow them.
+    holonomic = num_rates - (len(rows) - audit.constraint.shape[-1])
     found = dict(
-        constraint=rows,
-        constraint_rate=rows[: audit.constraint_rate.shape[-1]],
+        multiplier=rows,
+        constraint=rows[:holonomic] + rows[num_rates:],
+        constraint_rate=rows[:num_rates],
         momentum=number("", audit.momentum),
     )
     if isinstance(solution.ys, State):
@@ -134,11 +138,13 @@ def dataset(solution: Solution) -> Any:
     except ImportError as error:
         raise _missing("to_xarray", "xarray") from error
     reached, labels = ReachedRows(solution), _labels(solution)
+    has_position = labels["constraint"] == labels["multiplier"]
     dims = dict(
         q="coordinate",
         v="velocity",
+        multiplier="multiplier",
         multipliers="multiplier",
-        constraint="multiplier",
+        constraint="multiplier" if has_position else "constraint",
         constraint_rate="joint",
         momentum="symmetry",
     )

@@ -3,6 +3,7 @@ from .base import (
     Driven as Driven,
     Force as Force,
     State as State,
+    Symmetry as Symmetry,
 )
 from .canonical import (
     AbstractCanonicalSystem as AbstractCanonicalSystem,

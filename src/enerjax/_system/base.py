@@ -15,8 +15,10 @@ with `-dV/dq`. Units are the user's own, as long as they are consistent: a multi
 the dimension of an energy per unit of its constraint.
 
 Forces `f(q, v, t)` add `L^T f` to the right-hand side of the first equation. Driven
-constraints `g(q, t) = 0` add rows to `Phi`, and `g_q^T lambda` to `B^T lambda`. The rows
-are ordered: joints first, driven constraints next, relations between coordinates last.
+constraints `g(q, t) = 0` add rows to `Phi`, and `g_q^T lambda` to `B^T lambda`.
+Nonholonomic constraints `A(q) qdot = 0` add `A^T lambda`. The multipliers are ordered:
+joints first, driven constraints next, then nonholonomic constraints, and relations between
+coordinates last.
 """
 
 import abc
@@ -55,6 +57,9 @@ Force = TypeAliasType(
     "Force", Callable[[Coordinates, Velocities, Scalar, Args], Velocities]
 )
 Driven = TypeAliasType("Driven", Callable[[Coordinates, Scalar, Args], JointMultipliers])
+Nonholonomic = TypeAliasType(
+    "Nonholonomic", Callable[[Coordinates, Args], Float[Array, "k nq"]]
+)
 Symmetry = TypeAliasType("Symmetry", Callable[[Coordinates, Args], Float[Array, "ns nv"]])
 
 
@@ -75,11 +80,12 @@ class State(eqx.Module):
 
 
 class AbstractSystem(eqx.Module):
-    """A mechanical system with holonomic constraints, forces and drives."""
+    """A mechanical system with constraints, forces and drives."""
 
     constraint: eqx.AbstractVar[Constraint | None]
     force: eqx.AbstractVar[Force | None]
     driven: eqx.AbstractVar[Driven | None]
+    nonholonomic: eqx.AbstractVar[Nonholonomic | None]
     symmetry: eqx.AbstractVar[Symmetry | None]
     redundant: eqx.AbstractVar[bool]
     names: eqx.AbstractVar[Names | None]
@@ -114,10 +120,13 @@ SIGNATURES = dict(
     coordinate_constraint="(q, args)",
     force="(q, v, t, args)",
     driven="(q, t, args)",
+    nonholonomic="(q, args)",
     symmetry="(q, args)",
     kinematics="(q, args)",
 )
-_OPTIONAL = ("constraint", "coordinate_constraint", "force", "driven", "symmetry")
+_OPTIONAL = (
+    "constraint", "coordinate_constraint", "force", "driven", "nonholonomic", "symmetry",
+)  # fmt: skip
 
 
 def check_function(name: str, value: Any, signature: str) -> None:

@@ -17,6 +17,7 @@ from .base import (
     Constraint,
     Driven,
     Force,
+    Nonholonomic,
     Potential,
     State,
     Symmetry,
@@ -54,6 +55,7 @@ class LagrangianSystem(AbstractCanonicalSystem):
     constraint: Constraint | None = None
     force: Force | None = None
     driven: Driven | None = None
+    nonholonomic: Nonholonomic | None = None
     symmetry: Symmetry | None = None
     redundant: bool = eqx.field(default=False, static=True)
     names: Names | None = None
@@ -97,6 +99,7 @@ class HamiltonianSystem(AbstractCanonicalSystem):
     constraint: Constraint | None = None
     force: Force | None = None
     driven: Driven | None = None
+    nonholonomic: Nonholonomic | None = None
     symmetry: Symmetry | None = None
     redundant: bool = eqx.field(default=False, static=True)
     names: Names | None = None

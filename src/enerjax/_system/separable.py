@@ -17,6 +17,7 @@ from .base import (
     inexact,
     Kinematics,
     KineticEnergy,
+    Nonholonomic,
     Potential,
     SIGNATURES,
     State,
@@ -34,7 +35,7 @@ from .names import Names
 
 
 class System(AbstractSystem):
-    """A mechanical system with holonomic constraints, forces and drives.
+    """A mechanical system with constraints, forces and drives.
 
     **Arguments:**
 
@@ -58,6 +59,11 @@ class System(AbstractSystem):
     - `driven`: `driven(q, t, args)`, a vector that vanishes in every admissible
       configuration at time `t`: a moving pivot, a prescribed angle. It must be twice
       differentiable in `t`.
+    - `nonholonomic`: `A(q, args)`, the `(k, nq)` matrix of constraints `A(q) qdot = 0` on
+      the rates of the coordinates, such as rolling without slip or a knife edge; also with
+      `kinematics` one column for each coordinate. The constraint forces `-A^T lambda` do no
+      work. A constraint that is the derivative of a function of `q` belongs in
+      `constraint`, where positions do not drift.
     - `symmetry`: `symmetry(q, args)`, shape `(ns, nv)`. Each row contains the velocities of
       a motion that changes neither energy nor constraints, such as a common translation or
       rotation. The audit then reports the momenta that belong to these motions; nothing
@@ -94,6 +100,7 @@ class System(AbstractSystem):
     coordinate_constraint: Constraint | None
     force: Force | None
     driven: Driven | None
+    nonholonomic: Nonholonomic | None
     symmetry: Symmetry | None
     redundant: bool = eqx.field(static=True)
     names: Names | None
@@ -109,6 +116,7 @@ class System(AbstractSystem):
         coordinate_constraint: Constraint | None = None,
         force: Force | None = None,
         driven: Driven | None = None,
+        nonholonomic: Nonholonomic | None = None,
         symmetry: Symmetry | None = None,
         redundant: bool = False,
         rigid_bodies: Any = None,
@@ -142,6 +150,7 @@ class System(AbstractSystem):
         self.coordinate_constraint = coordinate_constraint
         self.force = force
         self.driven = driven
+        self.nonholonomic = nonholonomic
         self.symmetry = symmetry
         self.redundant = redundant
         self.names = names
@@ -185,6 +194,7 @@ class System(AbstractSystem):
         *,
         force: Force | None = None,
         driven: Driven | None = None,
+        nonholonomic: Nonholonomic | None = None,
         symmetry: Symmetry | None = None,
         redundant: bool = False,
         names: Names | None = None,
@@ -205,8 +215,8 @@ class System(AbstractSystem):
         - `constraint`: `constraint(q, args)`, a vector that vanishes in every admissible
           configuration. Leave it out if there is none.
         - `force`: `force(q, qdot, t, args)`, shape `(nq,)`, conjugate to `qdot`.
-        - `driven`: `driven(q, t, args)`; `symmetry`, `redundant`, `names`, `events`: see
-          `System`.
+        - `driven`: `driven(q, t, args)`; `nonholonomic`: `A(q, args)`, shape `(k, nq)`;
+          `symmetry`, `redundant`, `names`, `events`: see `System`.
 
         **Returns:** a system that all functions accept like a `System`; the `v` of a
         `State` is `qdot`, shape `(nq,)`.
@@ -217,6 +227,7 @@ class System(AbstractSystem):
             constraint=constraint,
             force=force,
             driven=driven,
+            nonholonomic=nonholonomic,
             symmetry=symmetry,
             redundant=redundant,
             names=names,
@@ -230,6 +241,7 @@ class System(AbstractSystem):
         *,
         force: Force | None = None,
         driven: Driven | None = None,
+        nonholonomic: Nonholonomic | None = None,
         symmetry: Symmetry | None = None,
         redundant: bool = False,
         names: Names | None = None,
@@ -249,8 +261,9 @@ class System(AbstractSystem):
         - `constraint`: as for `from_lagrangian`. It is enforced for `q`, and
           `B(q) dH/dp = 0` for `p`.
         - `force`: `force(q, qdot, t, args)`, shape `(nq,)`, conjugate to `qdot = dH/dp`.
-        - `driven`: `driven(q, t, args)`; `symmetry` (rows of `qdot`), `redundant`,
-          `names`, `events`: see `System`.
+        - `driven`: `driven(q, t, args)`; `nonholonomic`: `A(q, args)`, the matrix of
+          constraints `A(q) dH/dp = 0`; `symmetry` (rows of `qdot`), `redundant`, `names`,
+          `events`: see `System`.
 
         **Returns:** a system that all functions accept like a `System`; the `v` of a
         `State` is the momentum `p`, shape `(nq,)`. The audit counts `H(q, 0)` as potential
@@ -261,6 +274,7 @@ class System(AbstractSystem):
             constraint=constraint,
             force=force,
             driven=driven,
+            nonholonomic=nonholonomic,
             symmetry=symmetry,
             redundant=redundant,
             names=names,

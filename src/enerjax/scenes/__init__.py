@@ -16,6 +16,7 @@ from ._importing import from_mjcf as from_mjcf, from_urdf as from_urdf
 from ._laws import (
     AbstractConstraintLaw as AbstractConstraintLaw,
     AbstractForceLaw as AbstractForceLaw,
+    AbstractNonholonomicLaw as AbstractNonholonomicLaw,
     AbstractPotentialLaw as AbstractPotentialLaw,
     AbstractSpringLaw as AbstractSpringLaw,
 )

@@ -10,11 +10,11 @@ from .._programs import compiled
 from .._types import Coordinates, Scalar
 from ._frames import Frame, Numbers
 from ._functions import drives_at, inerters_at
-from ._laws import Deviation, Driven, Flywheel, Length
+from ._laws import AbstractNonholonomicLaw, all_rows, Deviation, Driven, Flywheel, Length
 from ._layout import Layout, Links
 from ._measures import Separation, Slide
 from ._parameters import Parameters
-from ._pose_view import evaluate, View
+from ._pose_view import evaluate, evaluate_slip, View
 from ._reactions import moved, no_motion, pivot_of
 from ._row_index import members
 from ._user_functions import vector_of
@@ -55,11 +55,16 @@ def measured(
 
     joints = list(zip(layout.joint_groups, args.tables["joints"], strict=True))
     bodies = _Bodies(layout, q, qdot, args, [*joints, *kept(q, t)])
-    found = []
+    found, at = [], View(layout, q)
     for group, numbers in joints:
-        rows = lambda x, group=group, numbers=numbers: evaluate(
-            group, View(layout, x), numbers
-        )
+
+        def rows(x: Coordinates, group: Links = group, numbers: Numbers = numbers) -> Array:
+            values = evaluate(group, View(layout, x), numbers)
+            if not isinstance(group.law, AbstractNonholonomicLaw):
+                return values
+            slip = evaluate_slip(group, View(layout, x), at, numbers)
+            return jnp.concatenate([values, slip], axis=1)
+
         pair = jax.jvp(rows, (q,), (qdot,))
         found.append(bodies.compared(group, numbers, pair))
     for name, function in layout.constraints:
@@ -139,7 +144,9 @@ class _Bodies:
 
         def slope(a: Frame, b: Frame, numbers: Numbers, size: Scalar) -> Array:
             pivot = pivot_of(b, numbers)
-            rows = lambda shift, turn: group.law(a, moved(b, pivot, shift, turn), numbers)
+            rows = lambda shift, turn: all_rows(
+                group.law, a, moved(b, pivot, shift, turn), (a, b), numbers
+            )
             zero = no_motion(pivot.size, pivot.dtype)
             shift, turn = jax.jacfwd(rows, argnums=(0, 1))(*zero)
             return jnp.linalg.norm(jnp.concatenate([shift, turn / size], axis=1), axis=1)

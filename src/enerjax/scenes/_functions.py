@@ -18,7 +18,7 @@ from ._laws import AbstractForceLaw, Acting, Driven, Gap
 from ._layout import Layout, Links
 from ._motion_view import Moving
 from ._parameters import Parameters
-from ._pose_view import evaluate, lift, rows, View
+from ._pose_view import evaluate, evaluate_slip, lift, rows, View
 from ._user_functions import ask, vector_of
 
 
@@ -37,6 +37,7 @@ def make_system(layout: Layout, over_constrained: bool, row_names: Sequence[str]
         coordinate_constraint=eqx.Partial(redundancy, layout) if redundant else None,
         force=eqx.Partial(force, layout) if layout.has_pushes else None,
         driven=eqx.Partial(driven, layout) if layout.drives else None,
+        nonholonomic=eqx.Partial(no_slip, layout) if layout.nonholonomic_groups else None,
         redundant=over_constrained,
         rigid_bodies=layout.rigid_bodies,
         names=Names(q, v, row_names),
@@ -120,6 +121,21 @@ def constraint(layout: Layout, q: Coordinates, args: Parameters) -> Multipliers:
         for group, numbers in inerters_at(layout, q, args)
     ]
     return jnp.concatenate(parts)
+
+
+def no_slip(layout: Layout, q: Coordinates, args: Parameters) -> Float[Array, "k nq"]:
+    """The matrix of the nonholonomic constraints: the rates at which contacts slip."""
+    at = View(layout, q)
+
+    def slip(x: Coordinates) -> Array:
+        view = View(layout, x)
+        found = [
+            evaluate_slip(group, view, at, args.tables["joints"][k]).reshape(-1)
+            for k, group in layout.nonholonomic_groups
+        ]
+        return jnp.concatenate(found)
+
+    return jax.jacrev(slip)(q)
 
 
 def inerters_at(

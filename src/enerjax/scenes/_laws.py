@@ -95,6 +95,87 @@ class Curve(AbstractConstraintLaw):
         return self.function(a.components(apart), numbers)
 
 
+class AbstractNonholonomicLaw(AbstractConstraintLaw):
+    """A joint that also forbids two bodies to slip where they touch.
+
+    Its rows keep the bodies in contact, and may be none. The velocities of both bodies at
+    the contact are equal along some directions, which are nonholonomic constraints.
+    """
+
+    @abc.abstractmethod
+    def contact(self, a: Frame, b: Frame, numbers: Numbers) -> tuple[Point, Array]:
+        """The point in space where the bodies touch, and the directions along which they
+        must not slip as rows, shape `(k, d)`."""
+
+    def slip(self, a: Frame, b: Frame, at: tuple[Frame, Frame], numbers: Numbers) -> Array:
+        """The displacements that are forbidden when the bodies move from the frames `at`
+        to `a` and `b`, in the limit of short ones; shape `(k,)`.
+
+        The points of the bodies are those that are in contact at first.
+        """
+        place, directions = self.contact(*at, numbers)
+        first, second = (
+            frame.point(old.components(place - old.origin))
+            for frame, old in zip((a, b), at, strict=True)
+        )
+        return directions @ (second - first)
+
+
+def all_rows(
+    law: AbstractLaw, a: Frame, b: Frame, at: tuple[Frame, Frame], numbers: Numbers
+) -> Any:
+    """The rows of a law, followed by the slip of a contact from the frames `at`."""
+    rows = law(a, b, numbers)
+    if isinstance(law, AbstractNonholonomicLaw):
+        rows = jnp.concatenate([rows, law.slip(a, b, at, numbers)])
+    return rows
+
+
+@dataclass(frozen=True)
+class Rolling(AbstractNonholonomicLaw):
+    """A disc or sphere on a plane (in the plane, on a line) of the first body.
+
+    - `has_axle`: whether it is a disc in space, whose axle is `numbers["axle"]`.
+
+    The row of a disc is quadratic in the frames, so that its discrete gradient is exact.
+    """
+
+    has_axle: bool
+
+    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Multipliers:
+        normal, radius = self._normal(a, numbers), numbers["radius"]
+        height = jnp.sum(offset(a, b, numbers) * normal)
+        if not self.has_axle:
+            return (height - radius)[None]
+        lean = jnp.sum(b.direction(numbers["axle"]) * normal)
+        return (height**2 + radius**2 * (lean**2 - 1))[None]
+
+    def contact(self, a: Frame, b: Frame, numbers: Numbers) -> tuple[Point, Array]:
+        down = -self._normal(a, numbers)
+        if self.has_axle:
+            axle = b.direction(numbers["axle"])
+            down = down - jnp.sum(down * axle) * axle
+            down = down / jnp.sqrt(jnp.sum(down**2))
+        place = b.point(numbers["point_b"]) + numbers["radius"] * down
+        along = [a.direction(numbers["frame_a"][k]) for k in range(down.size)]
+        return place, jnp.stack(along[:1] if down.size == 2 else along[:2])
+
+    def _normal(self, a: Frame, numbers: Numbers) -> Point:
+        return a.direction(numbers["frame_a"][-1])
+
+
+@dataclass(frozen=True)
+class Edge(AbstractNonholonomicLaw):
+    """A point of the second body that does not slip along the direction
+    `numbers["side"]`."""
+
+    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Multipliers:
+        return b.origin[:0]
+
+    def contact(self, a: Frame, b: Frame, numbers: Numbers) -> tuple[Point, Array]:
+        return b.point(numbers["point_b"]), b.direction(numbers["side"])[None]
+
+
 class AbstractPotentialLaw(AbstractLaw):
     """A potential energy of two bodies, a smooth function of their frames."""
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ._body_coordinates import AbstractBodyCoordinates
 from ._frames import GROUND
-from ._laws import AbstractForceLaw
+from ._laws import AbstractForceLaw, AbstractNonholonomicLaw
 from ._measures import AbstractLaw
 
 
@@ -123,6 +123,12 @@ class Layout:
     @property
     def has_constraints(self) -> bool:
         return bool(self.joints or self.constraints or self.inerters)
+
+    @property
+    def nonholonomic_groups(self) -> tuple[tuple[int, Links], ...]:
+        """The groups of joints that forbid bodies to slip, and their numbers."""
+        groups = enumerate(self.joint_groups)
+        return tuple(x for x in groups if isinstance(x[1].law, AbstractNonholonomicLaw))
 
     @property
     def rigid_bodies(self) -> np.ndarray | None:

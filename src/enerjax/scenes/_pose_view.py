@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from .._programs import is_known
 from .._types import Coordinates, Scalar, Vector, Velocities
 from ._frames import Frame, Point
+from ._laws import AbstractNonholonomicLaw
 from ._layout import Layout, Links
 
 
@@ -146,6 +147,15 @@ def evaluate(group: Links, view: View, numbers: dict[str, Array]) -> Array:
     """The values of a law for all its links, one row each."""
     a, b = (view.frames(bodies, group.law.reads) for bodies in (group.a, group.b))
     return jax.vmap(group.law)(a, b, numbers)
+
+
+def evaluate_slip(group: Links, view: View, at: View, numbers: dict[str, Array]) -> Array:
+    """The slip of all contacts of a group, from the coordinates of `at` to those of
+    `view`, one row each."""
+    assert isinstance(group.law, AbstractNonholonomicLaw)
+    frames = lambda view: [view.frames(k, group.law.reads) for k in (group.a, group.b)]
+    (a, b), first = frames(view), frames(at)
+    return jax.vmap(group.law.slip)(a, b, tuple(first), numbers)
 
 
 def lift(layout: Layout, q: Coordinates, v: Velocities) -> Coordinates:

@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from .._types import Coordinates, Scalar
 from ._frames import Frame, Numbers, Point
-from ._laws import Driven, Flywheel
+from ._laws import all_rows, Driven, Flywheel
 from ._layout import Layout, Links
 from ._parameters import Parameters
 from ._pose_view import View
@@ -62,7 +62,8 @@ def reaction(
     pivot = pivot_of(b, numbers)
 
     def work(shift: Point, turn: Array) -> Scalar:
-        return -jnp.sum(multipliers * group.law(a, moved(b, pivot, shift, turn), numbers))
+        end = moved(b, pivot, shift, turn)
+        return -jnp.sum(multipliers * all_rows(group.law, a, end, (a, b), numbers))
 
     return Reaction(*jax.grad(work, argnums=(0, 1))(*no_motion(pivot.size, pivot.dtype)))
 

@@ -12,11 +12,12 @@ from ._functions import (
     drives_at,
     inerters_at,
     internal,
+    no_slip,
     redundancy,
 )
 from ._layout import Layout
 from ._parameters import Parameters
-from ._pose_view import evaluate, View
+from ._pose_view import evaluate, evaluate_slip, View
 from ._user_functions import vector_of
 
 
@@ -59,6 +60,24 @@ def rows_of(layout: Layout, q: Coordinates, args: Parameters) -> dict[str, slice
     return places
 
 
+def slips_of(
+    layout: Layout, q: Coordinates, args: Parameters, rows: dict[str, slice]
+) -> dict[str, slice]:
+    """The rows of the nonholonomic constraints of each part, which follow all others but
+    the relations between coordinates."""
+    at, found, first = View(layout, q), {}, _num_held(layout, q, args, rows)
+    for k, group in layout.nonholonomic_groups:
+        numbers = args.tables["joints"][k]
+        slip = lambda q, group=group, numbers=numbers: evaluate_slip(
+            group, View(layout, q), at, numbers
+        )
+        width = jax.eval_shape(slip, q).shape[1]
+        for name in group.names:
+            found[name] = slice(first, first + width)
+            first += width
+    return found
+
+
 def check_reacting(
     joint: str, rows: dict[str, slice], ends: dict[str, tuple[str, str]]
 ) -> None:
@@ -75,21 +94,34 @@ def check_reacting(
 
 
 def row_names(
-    layout: Layout, q: Coordinates, args: Parameters, rows: dict[str, slice]
+    layout: Layout,
+    q: Coordinates,
+    args: Parameters,
+    rows: dict[str, slice],
+    slips: dict[str, slice],
 ) -> list[str]:
     """The name of each row of the constraints, in the order of the multipliers."""
-    inside = 0
-    if layout.has_constraints:
-        inside = jax.eval_shape(lambda q: constraint(layout, q, args), q).size
-    inside += layout.num_internal
     outside = jax.eval_shape(lambda q: redundancy(layout, q, args), q).size
-    last = max([inside, *(place.stop for place in rows.values())])
+    held = _num_held(layout, q, args, rows)
+    last = max([held, *(place.stop for place in slips.values())])
     names = [str(k) for k in range(last + outside)]
-    for name, place in rows.items():
+    named = [*rows.items(), *((f"{name}.slip", place) for name, place in slips.items())]
+    for name, place in named:
         several = place.stop - place.start > 1
         for k in range(place.start, place.stop):
             names[k] = f"{name}[{k - place.start}]" if several else name
     return names
+
+
+def _num_held(
+    layout: Layout, q: Coordinates, args: Parameters, rows: dict[str, slice]
+) -> int:
+    """The number of rows of joints, of drives, and inside of bodies."""
+    inside = 0
+    if layout.has_constraints:
+        inside = jax.eval_shape(lambda q: constraint(layout, q, args), q).size
+    inside += layout.num_internal
+    return max([inside, *(place.stop for place in rows.values())])
 
 
 def first_dependent(
@@ -107,6 +139,8 @@ def first_dependent(
     # The internal rows of bodies count first.
     rows = [row for k, row in enumerate(gradients) if k not in of_parts]
     rows += [*jax.jacfwd(lambda x: redundancy(layout, x, args))(q)]
+    if layout.nonholonomic_groups:
+        rows += [*no_slip(layout, q, args)]
     for name, place in places.items():
         rows += gradients[place]
         if np.linalg.matrix_rank(np.array(rows)) < len(rows):

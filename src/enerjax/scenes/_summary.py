@@ -10,6 +10,7 @@ def summary(
     kinds: dict[str, str],
     ends: dict[str, tuple[str, str]],
     rows: dict[str, slice],
+    slips: dict[str, slice],
     may_repeat: bool,
     count: Callable[[], int | None],
 ) -> str:
@@ -19,7 +20,8 @@ def summary(
     `count` finds the degrees of freedom.
     """
     bodies, joined = dict(layout.bodies), {x for pair in ends.values() for x in pair}
-    held = sum(place.stop - place.start for place in rows.values())
+    places = [*rows.values(), *slips.values()]
+    held = sum(place.stop - place.start for place in places)
     internal = sum(kind.num_internal for kind in bodies.values())
     independent = layout.num_velocities - internal - held
     freedoms, least = independent, ""
@@ -52,7 +54,12 @@ def summary(
     for name, place in rows.items():
         between = " - ".join(ends[name]) + ", " if name in ends else ""
         between += f"q[{own[name]}], " if name in own else ""
-        lines.append(line(name, f"{between}constraint[{place.start}:{place.stop}]"))
+        if place.stop > place.start or name not in slips:
+            between += f"constraint[{place.start}:{place.stop}], "
+        if name in slips:
+            slip = slips[name]
+            between += f"nonholonomic[{slip.start}:{slip.stop}], "
+        lines.append(line(name, between.removesuffix(", ")))
     others = [name for name in kinds if name not in bodies and name not in rows]
     lines += [line(name, " - ".join(ends.get(name, ()))) for name in others]
     return "\n".join(lines)

@@ -17,17 +17,21 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
+from .._programs import is_known
 from .._types import Real, Vector
-from ._arguments import module_of, positive
+from ._arguments import basis, direction, module_of, positive
 from ._ends import Ends
 from ._frames import Numbers
 from ._laws import (
     AbstractConstraintLaw,
     Alignment,
     Curve,
+    Edge,
     Length,
+    Rolling,
     SAME_AXIS,
     SAME_DIRECTIONS,
 )
@@ -196,6 +200,114 @@ class OnCurve(AbstractJoint):
         x = jnp.zeros((ends.dimension,))
         jax.eval_shape(lambda x: vector_of(self.name, self.curve, x, own), x)
         return Curve(self.curve), own | ends.point_of_body(self.point_b)
+
+
+class AbstractRolling(AbstractJoint):
+    """A body that rolls without slip on a plane, in the plane on a line.
+
+    - `radius`: of the rolling body, positive (length).
+    - `normal`: of the plane, in the frame of the first body, on the side of the rolling
+      body; by default the last axis of the frame.
+    - `point_a`: a point of the plane, by default the origin of the first body.
+    - `point_b`: the centre of the rolling body, by default its mass centre.
+    """
+
+    radius: Real
+    normal: Vector | None = eqx.field(default=None, kw_only=True)
+    point_a: Vector | None = eqx.field(default=None, kw_only=True)
+    point_b: Vector | None = eqx.field(default=None, kw_only=True)
+
+    def plane(self, ends: Ends) -> Numbers:
+        """The plane, with its normal in the last row of `frame_a`, the centre and the
+        radius."""
+        ends.only_bodies_that_turn()
+        up = [0.0] * (ends.dimension - 1) + [1.0] if self.normal is None else self.normal
+        normal = direction(ends.part, "`normal`", up, ends.dimension)
+        along = normal if ends.dimension == 3 else normal[::-1] * np.array([1.0, -1.0])
+        radius = positive(ends.part, "`radius`", self.radius)
+        numbers = dict(frame_a=basis(along), radius=radius)
+        return numbers | ends.origins(self.point_a, self.point_b)
+
+
+class RollingDisc(AbstractRolling):
+    """A disc or wheel of the second body that rolls without slip on a plane of the first.
+
+    One constraint keeps its edge on the plane. Nonholonomic constraints hold the lowest
+    point of the edge: two in space, where the disc may lean and turn, and one in the plane,
+    where it rolls on a line. `axis_b` is the axle of the disc, in the frame of the second
+    body; in the plane there is none. A disc must not lie flat.
+
+    The edge is a circle, without a width. In space the constraint is the square
+    `height^2 - radius^2 cos(lean)^2`, so its multiplier is no force; `scene.reaction` tells
+    the force and the torque about the centre.
+
+    Raises a `ValueError` for a disc that lies flat or is below its plane at the start.
+    """
+
+    axis_b: Vector | None = eqx.field(default=None, kw_only=True)
+
+    def resolve(self, ends: Ends) -> tuple[AbstractConstraintLaw, Numbers]:
+        numbers = self.plane(ends)
+        if ends.dimension == 2:
+            ends.refuse_axes(self.axis_b)
+            return Rolling(has_axle=False), numbers
+        if self.axis_b is None:
+            raise ValueError(f"{ends.part} needs `axis_b`, the axle of the disc.")
+        numbers["axle"] = direction(ends.part, "`axis_b`", self.axis_b, 3)
+        _check_upright(ends, numbers)
+        return Rolling(has_axle=True), numbers
+
+
+def _check_upright(ends: Ends, numbers: Numbers) -> None:
+    """Raises an error for a disc that is flat on its plane, or below it."""
+    a, b = ends.frames
+    if not is_known((a, b, numbers)):
+        return
+    normal, axle = numbers["frame_a"][2] @ a.axes, numbers["axle"] @ b.axes
+    if abs(normal @ axle) > 1 - 1e-9:
+        raise ValueError(f"The disc of {ends.part} lies flat on its plane at the start.")
+    centre = b.origin + numbers["point_b"] @ b.axes
+    if normal @ (centre - a.origin - numbers["point_a"] @ a.axes) < 0:
+        raise ValueError(
+            f"The centre of the disc of {ends.part} is below its plane at the start, on "
+            "the side opposite to the `normal`."
+        )
+
+
+class RollingSphere(AbstractRolling):
+    """A sphere of the second body that rolls without slip on a plane of the first.
+
+    One constraint keeps it on the plane, and two nonholonomic ones hold its lowest point.
+    It may spin about the normal. In space.
+    """
+
+    def resolve(self, ends: Ends) -> tuple[AbstractConstraintLaw, Numbers]:
+        ends.only_in_space("A rolling sphere")
+        return Rolling(has_axle=False), self.plane(ends)
+
+
+class KnifeEdge(AbstractJoint):
+    """Keeps a point of the second body from moving sideways: a skate, blade or runner.
+
+    One nonholonomic constraint: the velocity of the point relative to the first body has no
+    component along `axis_b`. In space another joint, such as `OnCurve`, must keep the edge
+    on its surface.
+
+    - `axis_b`: the direction across the edge, in the frame of the second body. In the plane
+      it is by default the second axis, so the edge is along the first.
+    - `point_b`: the point of the edge, by default the mass centre.
+    """
+
+    axis_b: Vector | None = eqx.field(default=None, kw_only=True)
+    point_b: Vector | None = eqx.field(default=None, kw_only=True)
+
+    def resolve(self, ends: Ends) -> tuple[AbstractConstraintLaw, Numbers]:
+        ends.only_bodies_that_turn()
+        axis = [0.0, 1.0] if self.axis_b is None and ends.dimension == 2 else self.axis_b
+        if axis is None:
+            raise ValueError(f"{ends.part} needs `axis_b`, the direction across the edge.")
+        side = direction(ends.part, "`axis_b`", axis, ends.dimension)
+        return Edge(), dict(side=side) | ends.point_of_body(self.point_b)
 
 
 class Constraint(AbstractFunctionOfPose):

@@ -25,7 +25,7 @@ from ._parameters import Parameters
 from ._pose_view import View
 from ._reactions import each, Reaction, reaction
 from ._readouts import measured_along, Readout
-from ._row_index import check_reacting, row_names, rows_of
+from ._row_index import check_reacting, row_names, rows_of, slips_of
 from ._start import check_poses, closed_start, gaps_of, PartialStart
 from ._summary import summary
 from .bodies import AbstractBody
@@ -92,7 +92,8 @@ class Scene:
         self.q, self.v = start_of(self._layout, self.args, bodies)
         check_laws(self._layout, self.q, self.args)
         self._rows = rows_of(self._layout, self.q, self.args)
-        names = row_names(self._layout, self.q, self.args, self._rows)
+        self._slips = slips_of(self._layout, self.q, self.args, self._rows)
+        names = row_names(self._layout, self.q, self.args, self._rows, self._slips)
         self.system = make_system(self._layout, redundant, names)
         if self.system.force is not None:  # checks the users' functions
             t = jnp.zeros((), self.q.dtype)
@@ -153,8 +154,9 @@ class Scene:
         """
         state = State(self.q, self.v) if state is None else state
         args = self.args if args is None else args
-        names = row_names(self._layout, self.q, args, self._rows)
-        joined = {k for x in self._rows.values() for k in range(x.start, x.stop)}
+        names = row_names(self._layout, self.q, args, self._rows, self._slips)
+        places = [*self._rows.values(), *self._slips.values()]
+        joined = {k for x in places for k in range(x.start, x.stop)}
         own = [k for k in range(len(names)) if k not in joined]
         return freedoms(self.system, state, args, t, names, own)
 
@@ -389,8 +391,15 @@ class Scene:
     def multipliers(
         self, sol: Solution | ConsistentStart | Equilibrium, joint: str
     ) -> Float[Array, "... rows"]:
-        """The multipliers of a joint, constraint or drive, one column for each row."""
-        return sol.multipliers[..., self._rows[joint]]
+        """The multipliers of a joint, constraint or drive, one column for each row.
+
+        Those that keep contacts from slipping follow those that keep them closed.
+        """
+        found = sol.multipliers[..., self._rows[joint]]
+        if joint not in self._slips:
+            return found
+        slip = sol.multipliers[..., self._slips[joint]]
+        return jnp.concatenate([found, slip], axis=-1)
 
     def columns(
         self, sol: Solution, args: Parameters | None = None
@@ -427,7 +436,7 @@ class Scene:
         return found
 
     def __str__(self) -> str:
-        parts = self._kinds, self._ends, self._rows
+        parts = self._kinds, self._ends, self._rows, self._slips
         return summary(self._layout, *parts, self.system.redundant, self._freedoms)
 
     def _freedoms(self) -> int | None:

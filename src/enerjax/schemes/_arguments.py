@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from .._discrete import AbstractDerivative
+from .._operators import AbstractModel
 from .._programs import is_known
 from .._types import Real, Scalar
 
@@ -24,6 +25,15 @@ def check_derivative(scheme: str, derivative: Any) -> None:
         raise TypeError(
             f"`{scheme}(derivative=...)` must be a discrete derivative such as "
             f"`ChainRule()`, got {derivative!r}{hint}"
+        )
+
+
+def refuse_nonholonomic(scheme: str, model: AbstractModel, why: str) -> None:
+    if model.system.nonholonomic is not None:
+        raise ValueError(
+            f"`{scheme}` cannot be used with `nonholonomic` constraints: {why}. Use "
+            "`EnergyPreserving`, `EnergyDecaying`, or for higher orders "
+            "`Composed(EnergyPreserving(), order)`."
         )
 
 

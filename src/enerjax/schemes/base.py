@@ -233,25 +233,55 @@ class StepProblem(eqx.Module):
         middle = 0.5 * (self.start.q + self.position(end))
         return self.model.delassus_matrix(middle, self.middle_time)
 
-    def rows(self, z: Increment, state: State, gradient: Gradient) -> Increment:
-        """The equations of one node: those of motion, and the constraints at the node."""
+    def constraint_rows(
+        self, z: Increment, state: State, jump: tuple[Increment, State] | None = None
+    ) -> Multipliers:
+        """The constraints at the node that `z` leads to, divided by `h`.
+
+        Nonholonomic constraints forbid displacements: from the start to the node, or from
+        the start to a node `jump` before it and from there to the node.
+        """
+        model, h = self.model, self.h
+        if model.system.nonholonomic is None:
+            return model.constraint(state.q, state.t) / h
+        displacement, slip, before = self.displacement(z), 0.0, self.start
+        if jump is not None:
+            to_jump = self.displacement(jump[0])
+            slip, before = model.slip(self.start.q, jump[1].q, to_jump), jump[1]
+            displacement = displacement - to_jump
+        slip = slip + model.slip(before.q, state.q, displacement)
+        joints, relations = model.joint(state.q, state.t), model.coordinate(state.q)
+        return jnp.concatenate([joints, slip, relations]) / h
+
+    def rows(
+        self,
+        z: Increment,
+        state: State,
+        gradient: Gradient,
+        jump: tuple[Increment, State] | None = None,
+    ) -> Increment:
+        """The equations of one node: those of motion, and the constraints at the node.
+
+        `jump` is the node at which the interval of `gradient` begins; by default this is
+        the start.
+        """
         h = self.h
         balance, rates = self.model.structure(self.start, state, h, z.rate, gradient)
         return Increment(
-            impulse=self.model.constraint(state.q, state.t) / h,
+            impulse=self.constraint_rows(z, state, jump),
             rate=balance,
             momentum=rates,
             velocity_impulse=self.joint_rate(state),
         )
 
-    def rows_of_balance(self, balance: Coordinates, end: State) -> Increment:
+    def rows_of_balance(self, z: Increment, balance: Coordinates, end: State) -> Increment:
         """The equations of a step: `balance`, and the constraints at the end of the step.
 
         `balance` is a residual of the balance of momentum, shape `(nq,)` (momentum). The
         problem must be one that `with_constant_inertia` has returned.
         """
         return Increment(
-            impulse=self.model.constraint(end.q, end.t) / self.h,
+            impulse=self.constraint_rows(z, end),
             rate=balance,
             momentum=jnp.zeros((0,), balance.dtype),
             velocity_impulse=self.joint_rate(end),

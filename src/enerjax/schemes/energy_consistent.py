@@ -10,7 +10,12 @@ from .._programs import is_known
 from .._solvers import Assembled
 from .._system import State
 from .._types import Multipliers, Real, Scalar, Velocities
-from ._arguments import alpha_from_spectral_radius, as_alpha, check_derivative
+from ._arguments import (
+    alpha_from_spectral_radius,
+    as_alpha,
+    check_derivative,
+    refuse_nonholonomic,
+)
 from ._chord import step_chord
 from ._discontinuous import JumpAndEnd
 from ._dissipative_stiffness import dissipative_stiffness, DissipativeStiffness
@@ -54,8 +59,8 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
       to 6 or 8; else 3. The order is 2 with forces, which enter as in `EnergyPreserving`,
       and where the `derivative` is not `MeanValue()` and `V` is not quadratic. Driven
       constraints do not reduce the order.
-    - Requires `v = qdot` or momenta. For systems with `kinematics` use `EnergyPreserving`
-      or `EnergyDecaying`.
+    - Requires `v = qdot` or momenta, and holonomic constraints. For systems with
+      `kinematics` or `nonholonomic` use `EnergyPreserving` or `EnergyDecaying`.
 
     **Arguments:**
 
@@ -63,7 +68,7 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
     - `derivative`: the discrete gradient; `MeanValue()` for the full order.
 
     Raises a `ValueError` for a known `alpha` outside [0, 1] and for a system with
-    `kinematics`.
+    `kinematics` or `nonholonomic` constraints.
 
     **Reference:** unconstrained at `alpha = 0` the fourth-order method of G. R. W. Quispel
     and D. I. McLaren, J. Phys. A 41 (2008) 045206, eq. (14); the dissipative and the
@@ -105,6 +110,11 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
         return 4 if self.symmetric else 3
 
     def problem(self, model: AbstractModel, start: State, h: Scalar) -> _Problem:
+        refuse_nonholonomic(
+            "EnergyConsistent",
+            model,
+            "its order rests on the Hessian of the constraints, and these have none",
+        )
         if not model.has_canonical_rates:
             raise ValueError(
                 "`EnergyConsistent` needs velocities that are the rates of the "

@@ -111,7 +111,7 @@ class EnergyDecaying(AbstractSchemeWithRotations[JumpAndEnd, StepProblem]):
         to_jump = jump_gradient(self.alpha, after, before, at_start, at_jump)
         return JumpAndEnd(
             jump=problem.rows(z.jump, jump, to_jump),  # eq. (47b)
-            end=problem.rows(z.end, end, after),  # eq. (47a)
+            end=problem.rows(z.end, end, after, (z.jump, jump)),  # eq. (47a)
         )
 
     def delassus_matrix(self, z: JumpAndEnd, problem: StepProblem) -> DelassusMatrix:

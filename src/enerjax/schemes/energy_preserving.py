@@ -20,6 +20,8 @@ class EnergyPreserving(AbstractSchemeWithRotations[Increment, StepProblem]):
       the velocity `Lm (q1 - q0)/h`, so a damper never creates energy.
     - Dissipates: nothing, not even high-frequency oscillations.
     - Constraints held at: position level; with `formulation="ggl"` velocity level too.
+      Nonholonomic constraints hold for the displacement, `A(qm) (q1 - q0) = 0`, instead of
+      the position.
     - Order: 2. Symmetric: `Composed` raises the order to 4, 6 or 8.
     - Rigid bodies in space (`rigid_bodies` of a `System`) are moved by rotations; linear
       and angular momentum are conserved to round-off where forces permit it.

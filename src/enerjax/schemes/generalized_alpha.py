@@ -7,7 +7,11 @@ from .._operators import AbstractModel, Increment
 from .._programs import is_known
 from .._system import State
 from .._types import Multipliers, Real, Scalar, Velocities
-from ._arguments import alpha_from_spectral_radius, check_formulation
+from ._arguments import (
+    alpha_from_spectral_radius,
+    check_formulation,
+    refuse_nonholonomic,
+)
 from .base import AbstractSchemeWithMemory, Formulation, StepEnd, StepProblem
 
 
@@ -46,7 +50,7 @@ class GeneralizedAlpha(AbstractSchemeWithMemory[Increment, _AlphaProblem]):
       this start has to decay first. With constraints this requires `rho_inf < 1`: at 1
       (and for `newmark`) errors of the multipliers do not decay.
     - Multipliers: `lambda1`, those at the end of the step.
-    - For a `System` without `kinematics`. Others raise a `ValueError`.
+    - For a `System` without `kinematics` and `nonholonomic`. Others raise a `ValueError`.
     - `step` without `warm` begins again with `a0 = vdot0`.
 
     **Arguments:**
@@ -141,6 +145,9 @@ class GeneralizedAlpha(AbstractSchemeWithMemory[Increment, _AlphaProblem]):
         return False
 
     def problem(self, model: AbstractModel, start: State, h: Scalar) -> _AlphaProblem:
+        refuse_nonholonomic(
+            "GeneralizedAlpha", model, "it imposes constraints on positions alone"
+        )
         step = StepProblem.with_constant_inertia(
             "GeneralizedAlpha", model, start, h, self.formulation
         )
@@ -164,7 +171,7 @@ class GeneralizedAlpha(AbstractSchemeWithMemory[Increment, _AlphaProblem]):
         end, after = self._end(z, problem)
         load = model.inertia @ after.acceleration + model.slope(end)
         balance = step.h * load + model.constraint_force(end.q, end.t, z.impulse)
-        return step.rows_of_balance(balance, end)
+        return step.rows_of_balance(z, balance, end)
 
     def finish(self, z: Increment, problem: _AlphaProblem) -> StepEnd:
         step, before = problem.step, problem.before

@@ -8,7 +8,7 @@ from .._operators import AbstractModel, Gradient, Increment, Reaction
 from .._results import RESULTS
 from .._system import State
 from .._types import Multipliers, Scalar, Velocities
-from ._arguments import as_alpha, check_derivative
+from ._arguments import as_alpha, check_derivative, refuse_nonholonomic
 from ._discontinuous import (
     jump_energy,
     jump_gradient,
@@ -52,7 +52,8 @@ class KappaDecaying(AbstractOneSolveScheme[_Unknowns, StepProblem]):
     - `alpha`: the dissipation, in [0, 1]. It can be traced, swept and differentiated.
     - `derivative`: the discrete gradient.
 
-    Raises a `ValueError` for a known `alpha` outside [0, 1].
+    Raises a `ValueError` for a known `alpha` outside [0, 1] and for a system with
+    `nonholonomic` constraints.
 
     **Reference:** E. Lens and A. Cardona, section 5.3, eq. (66) to (71).
     """
@@ -76,6 +77,9 @@ class KappaDecaying(AbstractOneSolveScheme[_Unknowns, StepProblem]):
         return False
 
     def problem(self, model: AbstractModel, start: State, h: Scalar) -> StepProblem:
+        refuse_nonholonomic(
+            "KappaDecaying", model, "the paper defines it for holonomic constraints"
+        )
         return StepProblem(model, start, h, self.derivative)
 
     def predict(

@@ -23,6 +23,8 @@ class Rattle(AbstractSchemeWithChord[Increment, StepProblem]):
     - Constraints held at: position and velocity level.
     - Order: 2. Symmetric: `Composed` raises the order to 4, 6 or 8.
     - Multipliers: `(lambda0 + lambda1)/2`, the mean over the step.
+    - With `nonholonomic` constraints `A((q0 + q1)/2) V = 0`, their rows are among those of
+      `B0` and `B1`, and nothing is symplectic.
     - For a `System` without `kinematics`. Others raise a `ValueError`. A `force` may depend
       on the velocity; it is evaluated with `V` at both ends.
 
@@ -58,7 +60,7 @@ class Rattle(AbstractSchemeWithChord[Increment, StepProblem]):
         start, middle = problem.start, z.rate
         pulled = self._pulled(problem, start.q, middle, start.t, z.impulse)
         balance = problem.separable_model.inertia @ (middle - start.v) + 0.5 * pulled
-        return problem.rows_of_balance(balance, self._end(z, problem))
+        return problem.rows_of_balance(z, balance, self._end(z, problem))
 
     def delassus_matrix(self, z: Increment, problem: StepProblem) -> DelassusMatrix:
         return problem.delassus_matrix(z)

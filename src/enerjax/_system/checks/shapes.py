@@ -89,6 +89,7 @@ def check_shapes(system: AbstractSystem, state: State, args: Args) -> None:
             )
     rows = _rows("constraint", system.constraint, state.q, args)
     rows += _rows("driven", system.driven, state.q, state.t, args) + internal
+    rows += _matrix_rows("nonholonomic", system.nonholonomic, state, args)
     if rows > state.q.size and not system.redundant:
         raise ValueError(
             f"{rows} constraints of {state.q.size} coordinates cannot be independent"
@@ -181,6 +182,20 @@ def _rows(role: str, fn: Callable | None, *inputs: Any) -> int:
         raise ValueError(
             f"{describe(role, fn)} must return a vector, got shape {shape}. "
             "Wrap a single constraint as `jnp.array([value])`."
+        )
+    return shape[0]
+
+
+def _matrix_rows(role: str, fn: Callable | None, state: State, args: Args) -> int:
+    """The number of rows of a matrix that acts on the rates of the coordinates."""
+    if fn is None:
+        return 0
+    shape = _shape(role, fn, state.q, args)
+    if len(shape) != 2 or shape[1] != state.q.size:
+        raise ValueError(
+            f"{describe(role, fn)} returned shape {shape}: give the matrix `A` in "
+            f"`A qdot = 0`, with {state.q.size} columns, one for each coordinate. A single "
+            "row is `row[None]`."
         )
     return shape[0]
 

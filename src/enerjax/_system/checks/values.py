@@ -41,6 +41,7 @@ def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]
     if system.driven is not None and t is not None:
         timed.append(system.driven(state.q, t, args))
     return dict(
+        **_nonholonomic(system, state, args),
         start=finite(state),
         args=finite([x for x in jax.tree.leaves(args) if eqx.is_inexact_array(x)]),
         potential=finite(system.potential_energy(state, args)),
@@ -54,6 +55,17 @@ def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]
         symmetric=jnp.all(jnp.abs(blocks - jnp.swapaxes(blocks, 1, 2)) <= eps),
         **_definiteness(system, inertia),
         rigid=_is_rigid(system, state, inertia, args),
+    )
+
+
+def _nonholonomic(system: AbstractSystem, state: State, args: Args) -> dict[str, Flag]:
+    """Whether the rows of the matrix of these constraints are finite, and none is zero."""
+    if system.nonholonomic is None:
+        return {}
+    matrix = system.nonholonomic(state.q, args)
+    return dict(
+        nonholonomic=jnp.all(jnp.isfinite(matrix)),
+        acts=jnp.array(system.redundant) | jnp.all(jnp.any(matrix != 0, axis=1)),
     )
 
 
@@ -127,7 +139,7 @@ def check_values(system: AbstractSystem, state: State, args: Args) -> None:
         system, kinetic
     )
     for name, message in messages.items():
-        if not facts[name]:
+        if not facts.get(name, True):
             raise ValueError(message)
 
 
@@ -152,6 +164,14 @@ def _messages_of_start(potential: str | None, state: State, args: Args) -> dict[
         "slopes": (
             f"The slope of a constraint is not finite at the start, q = {state.q}. Write "
             "lengths as squares: `d @ d - l**2`."
+        ),
+        "nonholonomic": (
+            f"The matrix of `nonholonomic` is not finite at the start, q = {state.q}. Is "
+            "it defined there?"
+        ),
+        "acts": (
+            "A row of the matrix of `nonholonomic` is zero at the start, so it constrains "
+            f"nothing there, q = {state.q}. Is it the derivative of a square?"
         ),
         "depends": (
             "A row of the constraints does not depend on `q` at the start: is it constant, "
