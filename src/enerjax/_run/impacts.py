@@ -103,7 +103,7 @@ class Impacts(eqx.Module):
         """The system with a constraint for each gap, none of which is closed."""
         # The constructors of systems convert their arguments, so a copy is changed.
         new = copy.copy(system)
-        # Scales are those of gaps that are closed; see `Watcher.model`.
+        # Scales are those of gaps that are closed; see `Watcher.begin`.
         resting = jnp.ones((len(self.impacts),), dtype)
         constraint = _WithGaps(system.constraint, self, resting)
         object.__setattr__(new, "constraint", constraint)

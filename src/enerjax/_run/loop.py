@@ -14,12 +14,13 @@ from .._solvers import RootFinder
 from .._system import State
 from .._types import Count, Flag, Multipliers, Scalar
 from ..schemes import AbstractScheme, Energies
-from .event_search import Found, Happening, no_search, settle, Watch, Watcher
+from .event_search import Found, no_search, settle, Watch
 from .halving import select
 from .reverse import keep_roots, loops
 from .saving import Begin, Costs, Record, with_time
 from .step import advance, first_warm, model_for, StepOutput, Warm
 from .step_sizes import AbstractPlan, Verdict
+from .watcher import Happening, Watcher
 
 
 class Progress(eqx.Module):
@@ -62,7 +63,8 @@ class Stepper(eqx.Module):
         timed = with_time(model, plan, start, place)
         watch = varying = opens = None
         if self.watcher is not None:
-            watch, varying, opens = self.watcher.begin(model, timed, plan.time(place))
+            t = plan.time(place)
+            watch, varying, opens = self.watcher.begin(model, timed, t, h)
             model = eqx.combine(varying, model)
         result = _check_start(scheme, model, timed, h)
         result = result if opens is None else first_failure(result, opens)
@@ -178,7 +180,7 @@ class _AttemptWithEvents(eqx.Module):
         constant = jax.lax.stop_gradient((begin, out.state)), jax.lax.stop_gradient(times)
         now = jax.lax.stop_gradient(values)
         extremum = self.watcher.extremum(model, *constant, watch, now)
-        found = self.watcher.find(watch, values, self.length, extremum)
+        found = self.watcher.found(watch, values, self.length, extremum)
         return out, found
 
 

@@ -17,9 +17,9 @@ from .._system import State
 from .._types import Args, Count, Flag, Multipliers, Scalar, Times, Vector
 from ..schemes import Energies
 from .collocation import state_within
-from .event_search import Happening
 from .inputs import positive_integer
 from .step_sizes import AbstractController, AbstractPlan, EqualSteps, NEAR
+from .watcher import Happening
 
 
 SaveFunction = TypeAliasType("SaveFunction", Callable[[Scalar, State, Args], PyTree[Any]])

@@ -11,7 +11,6 @@ from .._solvers import Newton, RootFinder
 from .._system import AbstractSystem, State
 from .._types import Args, Real, Scalar
 from ..schemes import AbstractScheme
-from .event_search import watcher_of
 from .events import AbstractEvent
 from .failure import explained_memory_error, raise_failure
 from .inputs import check_halvings, prepare
@@ -21,6 +20,7 @@ from .saving import RecordedRun, SaveAt, saving_of, with_events
 from .solution import first_rows, Solution
 from .step_sizes import AbstractController, EqualSteps, find_end
 from .task import Task
+from .watcher import watcher_of
 
 
 def simulate(

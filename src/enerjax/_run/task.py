@@ -14,13 +14,13 @@ from .._system import AbstractSystem, State
 from .._types import Args, Coordinates, Scalar
 from ..schemes import AbstractScheme
 from .audit import audit, Measures, measures
-from .event_search import Watcher
 from .events import Events
 from .loop import Progress, Stepper
 from .saving import AbstractSaving, Record, Rows, SaveFunction
 from .solution import Solution, Statistics
 from .step import model_for
 from .step_sizes import AbstractPlan
+from .watcher import Watcher
 
 
 class Task(eqx.Module):
