@@ -41,8 +41,9 @@ FAULTS = (
     Fault(
         "equilibrium: no time",
         "_analysis/equilibrium.py",
-        "lambda q: model.constraint(q, guess.t), q)",
-        "lambda q: model.constraint(q, jax.tree.map(jnp.zeros_like, guess.t)), q)",
+        "constraint, transpose = _constraint_near(model, q, guess.t, at_guess)",
+        "constraint, transpose = _constraint_near(model, q, jax.tree.map(jnp.zeros_like, "
+        "guess.t), at_guess)",
         "An equilibrium at a time holds drives where they are at time zero.",
         of("analysis::test_drives_stand_where_they_are_at_the_time"),
     ),

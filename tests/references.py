@@ -4,6 +4,7 @@ import functools
 from types import SimpleNamespace
 
 import numpy as np
+import scipy
 from scipy.integrate import solve_ivp
 
 
@@ -205,3 +206,42 @@ CAR_AXIS = SimpleNamespace(
         ]
     ),
 )
+
+
+def cantilever_by_shooting(stiffness, length, force, steps=10):
+    """The displacement of the tip of a straight beam along x under a force at its tip.
+
+    The ordinary differential equations of the static beam are integrated from the clamp,
+    and Newton's method finds the moment there for which that at the tip vanishes. The
+    stiffness is that of stretch, shear, torsion and bending, `(6, 6)`.
+    """
+    flexibility, force = np.linalg.inv(stiffness), np.asarray(force)
+
+    def rates(s, y, load):
+        rotation, moment = y[3:12].reshape(3, 3), y[12:]
+        strain = flexibility @ np.append(rotation.T @ load, rotation.T @ moment)
+        slope = rotation @ (strain[:3] + np.eye(3)[0])
+        turning = np.cross(np.eye(3), strain[3:])  # minus the matrix of the cross product
+        return np.concatenate(
+            [slope, -(rotation @ turning.T).ravel(), -np.cross(slope, load)]
+        )
+
+    def tip(moment, load):
+        first = np.concatenate([np.zeros(3), np.eye(3).ravel(), moment])
+        return scipy.integrate.solve_ivp(
+            rates, (0.0, length), first, args=(load,), method="DOP853", rtol=1e-12,
+            atol=1e-12,
+        ).y[:, -1]  # fmt: skip
+
+    size = length * np.linalg.norm(force)
+    moment = np.zeros(3)
+    for load in force * np.arange(1, steps + 1)[:, None] / steps:
+        for _ in range(8):
+            left = tip(moment, load)[12:]
+            columns = [
+                (tip(moment + 1e-6 * size * unit, load)[12:] - left) / (1e-6 * size)
+                for unit in np.eye(3)
+            ]
+            moment = moment - np.linalg.solve(np.stack(columns, axis=1), left)
+    assert np.abs(tip(moment, force)[12:]).max() < 1e-9 * size
+    return tip(moment, force)[:3] - np.array([length, 0.0, 0.0])

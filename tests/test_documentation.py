@@ -28,8 +28,9 @@ def runs(mark):
 
 def with_code():
     pages = [page for page in PAGES if any(runs(mark) for mark, _ in code_blocks(page))]
-    # The scheme of this page is a file of the tests, which others run.
-    return long(pages, *(x for x in pages if x.name == "write-your-own-scheme.md"))
+    # Other tests run the scheme of one of these pages, and beams.
+    others = ("beams.md", "write-your-own-scheme.md")
+    return long(pages, *(x for x in pages if x.name in others))
 
 
 @pytest.mark.parametrize("page", with_code(), ids=lambda page: page.name)

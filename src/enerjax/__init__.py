@@ -78,6 +78,8 @@ from .scenes import (
     Reaction as Reaction,
     Readout as Readout,
     Scene as Scene,
+    Section as Section,
+    SectionForces as SectionForces,
     shapes as shapes,
 )
 from .schemes import (

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._operators import AbstractModel, make_model
+from .._operators import AbstractModel, make_model, Time
 from .._programs import compiled, is_known
 from .._solvers import find_root, largest, Newton, RootFinder
-from .._system import AbstractSystem, check_system, HamiltonianSystem, State
-from .._types import Args, Coordinates, Flag, Multipliers, Real, Scalar
+from .._system import AbstractSystem, check_system, HamiltonianSystem, State, System
+from .._types import Args, Coordinates, Flag, Increments, Multipliers, Real, Scalar
 
 
 # Long chains need many iterations: Newton's method wanders there before it converges.
@@ -25,6 +25,8 @@ _ITERATIONS_OF_ATTEMPT = 30
 _ITERATIONS_WITHOUT_SPRINGS = 8
 # Springs that are softer than this fraction of the first ones are removed.
 _SOFTEST = 1e-6
+# Load steps are divided down to this fraction of those that the user asked for.
+_SHORTEST_STEP = 1e-2
 
 
 class Equilibrium(eqx.Module):
@@ -46,6 +48,8 @@ def equilibrium(
     *,
     t: Real = 0.0,
     root_finder: RootFinder = Newton(),
+    from_args: Args = None,
+    steps: int = 1,
 ) -> Equilibrium:
     """Finds a pose where `dV/dq + B^T lambda = L^T f` and `Phi = 0`, from a guess.
 
@@ -62,13 +66,18 @@ def equilibrium(
       ignored. If it is far from an equilibrium, let a damped run come closer first.
     - `t`: the time at which forces and drives are frozen.
     - `root_finder`: for equations that are scaled to order one; see `simulate`.
+    - `from_args`, `steps`: load steps. The floats of `args` change linearly from those of
+      `from_args`, in this number of steps, and each step begins with the pose of the last.
+      Large deflections need them: `from_args=args.set("load", force=[0, 0, 0]), steps=10`.
+      A step without an equilibrium is divided, except under `jit`, `vmap` and `grad`.
 
     **Returns:** an `Equilibrium`.
 
-    **Raises:** `ValueError` if no equilibrium is found (under `jit`, `vmap` and `grad`
-    `equinox.EquinoxRuntimeError`); `ValueError` and `TypeError` for bad input, and for a
-    `System.from_hamiltonian`, whose momenta need not vanish in equilibrium, and for
-    `nonholonomic` constraints, with which equilibria are not isolated.
+    **Raises:** `ValueError` if no equilibrium is found, with the part of the load that had
+    one (under `jit`, `vmap` and `grad` `equinox.EquinoxRuntimeError`); `ValueError` and
+    `TypeError` for bad input, and for a `System.from_hamiltonian`, whose momenta need not
+    vanish in equilibrium, and for `nonholonomic` constraints, with which equilibria are not
+    isolated.
     """
     if system.nonholonomic is not None:
         raise ValueError(
@@ -77,17 +86,80 @@ def equilibrium(
             "out, and give constraints on positions instead where it must not move."
         )
     rest, args = at_rest(system, guess, args, t)
-    found, residual, ok = _solve(system, rest, args, root_finder)
+    rotates, is_near = _is_orthonormal(system, rest.q), from_args is not None
+    solve = lambda guess, args: _solve(system, guess, args, root_finder, rotates, is_near)
+    _check_steps(steps, from_args, args)
+    if from_args is None:
+        (found, residual, ok), reached = solve(rest, args), ""
+    else:
+        (found, residual, ok), part = _follow(solve, rest, from_args, args, steps)
+        reached = f" The part {part:.3g} of the way from `from_args` to `args` was reached."
     message = (
         "No equilibrium was found from this guess. There may be none (a free body under "
         "gravity?), the constraints may repeat each other, or the guess is too far: let a "
-        "damped run come closer."
+        "damped run come closer, or follow the loads in `steps`."
     )
     if not is_known((ok, found)):
         return eqx.error_if(found, ~ok, message)
     if not ok:
-        raise ValueError(f"{message} Largest residual, scaled: {residual:.1e}.")
+        raise ValueError(f"{message}{reached} Largest residual, scaled: {residual:.1e}.")
     return found
+
+
+def _is_orthonormal(system: AbstractSystem, q: Coordinates) -> bool:
+    """Whether the axes of all rigid bodies are known to be orthonormal, so that rotations
+    can move them. Otherwise constraints between the axes find the nearest that are."""
+    if not (isinstance(system, System) and is_known(q)):
+        return False
+    own = system.kinematics.constraint(q)
+    return bool(jnp.max(jnp.abs(own), initial=0) <= 1e3 * jnp.finfo(q.dtype).eps)
+
+
+def _check_steps(steps: Any, from_args: Args, args: Args) -> None:
+    if not isinstance(steps, int) or steps < 1:
+        raise ValueError(f"`steps` must be a positive number of load steps, got {steps!r}.")
+    if from_args is None and steps > 1:
+        raise ValueError(
+            "Load `steps` need `from_args`, the numbers before the first step: those of "
+            "`args` with loads of zero."
+        )
+    structures = [jax.tree.structure(x) for x in (from_args, args)]
+    if from_args is not None and structures[0] != structures[1]:
+        raise ValueError(
+            "`from_args` must have the structure of `args`; they differ in their entries."
+        )
+
+
+def _follow(
+    solve: Callable[[State, Args], tuple[Equilibrium, Scalar, Flag]],
+    rest: State,
+    from_args: Args,
+    args: Args,
+    steps: int,
+) -> tuple[tuple[Equilibrium, Scalar, Flag], float]:
+    """The equilibrium at the end of a path of loads, and the part of it that was reached.
+
+    Where values are known, a load step without an equilibrium is divided.
+    """
+
+    def at(part: float) -> Args:
+        between = lambda x, y: x + part * (y - x) if eqx.is_inexact_array_like(y) else y
+        return args if part == 1 else jax.tree.map(between, from_args, args)
+
+    reached, length, all_ok = 0.0, 1 / steps, jnp.array(True)
+    while True:
+        aim = 1.0 if reached + 1.001 * length > 1 else reached + length
+        found, residual, ok = solve(rest, at(aim))
+        if is_known((ok, found)) and not ok:
+            length = length / 2
+            if length * steps < _SHORTEST_STEP:
+                return (found, residual, ok), reached
+            continue
+        all_ok = all_ok & ok
+        if aim == 1:
+            return (found, residual, all_ok), aim
+        rest, reached = State(found.state.q, rest.v, rest.t), aim
+        rest = jax.lax.stop_gradient(rest)
 
 
 def at_rest(
@@ -106,43 +178,67 @@ def at_rest(
 
 @compiled
 def _solve(
-    system: AbstractSystem, guess: State, args: Args, root_finder: RootFinder
+    system: AbstractSystem,
+    guess: State,
+    args: Args,
+    root_finder: RootFinder,
+    rotates: bool,
+    is_near: bool,
 ) -> tuple[Equilibrium, Scalar, Flag]:
-    model = make_model(system, guess, args)
-    scales = model.scales
-    q0, size = guess.q, _force_size(model, guess)
-    unit = size / scales.coordinate
+    model = make_model(system, guess, args, rotates=rotates)
+    guess = model.to_internal(guess)
+    scales, size = model.scales, _force_size(model, guess)
+    q0, unit = guess.q, size / scales.step
+    at_guess = jnp.zeros_like(unit)
 
     def balance(x, inputs):
         model, unit, size, anchor, stiffness = inputs
         shift, scaled_multipliers = x
-        q = q0 + unit * shift
-        constraint, transpose = jax.vjp(lambda q: model.constraint(q, guess.t), q)
+        q = q0 + model.displacement(q0, unit * shift)
+        constraint, transpose = _constraint_near(model, q, guess.t, at_guess)
         slope = model.slope(State(q, guess.v, guess.t))
         force = slope + transpose(size * scaled_multipliers / scales.constraint)[0]
         rows = size * scales.constraint + scales.constraint_size
-        force = force / (size * scales.coordinate) + stiffness * (shift - anchor)
+        force = force / (size * scales.step) + stiffness * (shift - anchor)
         return force, constraint / rows
 
     # The balance has more rows than there are multipliers: these come closest to it.
-    jacobian = jax.jacfwd(model.constraint)(q0, guess.t) / scales.coordinate[None]
-    jacobian = jacobian / scales.constraint[:, None]
-    slope = model.slope(guess) / scales.coordinate
-    scaled_multipliers = jnp.linalg.lstsq(jacobian.T, -slope)[0] / size
-    first = (jnp.zeros_like(q0), scaled_multipliers)
-    inputs = (model, unit, size)
-    no_springs = jnp.zeros_like(q0), jnp.zeros_like(size)
-    with_springs = lambda x, springs: balance(x, (*inputs, *springs))
-    stiffness = _stiffness_above_potential(with_springs, first, q0 / unit)
-    near = _descend(with_springs, root_finder, first, stiffness)
+    _, transpose = _constraint_near(model, q0, guess.t, at_guess)
+    rows = jax.vmap(transpose)(jnp.diag(1 / scales.constraint))[0] / scales.step[None]
+    slope = model.slope(guess) / scales.step
+    scaled_multipliers = jnp.linalg.lstsq(rows.T, -slope)[0] / size
+    first = at_guess, scaled_multipliers
+    inputs = model, unit, size
+    no_springs = at_guess, jnp.zeros_like(size)
+    near, others = first, [first, first]
+    if not is_near:
+        with_springs = lambda x, springs: balance(x, (*inputs, *springs))
+        far = largest(q0 * scales.coordinate) / size
+        stiffness = _stiffness_above_potential(with_springs, first, far)
+        near, others = _descend(with_springs, root_finder, first, stiffness), []
     root = find_root(
-        balance, root_finder, near, (*inputs, *no_springs), max_iterations=_MAX_ITERATIONS
+        balance,
+        root_finder,
+        near,
+        (*inputs, *no_springs),
+        max_iterations=_MAX_ITERATIONS,
+        others=others,
     )
     shift, scaled_multipliers = root.value
-    q: Coordinates = q0 + unit * shift
+    q: Coordinates = q0 + model.displacement(q0, unit * shift)
     multipliers = size * scaled_multipliers / scales.constraint
     residual = largest(jnp.concatenate(balance(root.value, (*inputs, *no_springs))))
-    return Equilibrium(State(q, guess.v), multipliers), residual, root.found
+    state = State(q, jnp.zeros_like(model.to_user(guess).v))
+    return Equilibrium(state, model.user_multipliers(multipliers)), residual, root.found
+
+
+def _constraint_near(
+    model: AbstractModel, q: Coordinates, t: Time, no_step: Increments
+) -> tuple[Multipliers, Callable]:
+    """The constraints, and a function from multipliers to the rows of their forces."""
+    return jax.vjp(
+        lambda step: model.constraint(q + model.displacement(q, step), t), no_step
+    )
 
 
 def _descend(
@@ -185,20 +281,23 @@ def _descend(
 def _stiffness_above_potential(
     balance: Callable[[Any, tuple[Array, Scalar]], Any],
     guess: tuple[Array, Array],
-    scaled_q: Array,
+    far: Scalar,
 ) -> Scalar:
-    """A stiffness above that of the potential, which is estimated at the guess."""
-    no_springs = jnp.zeros_like(guess[0]), jnp.zeros((), scaled_q.dtype)
-    along = jnp.cos(jnp.arange(scaled_q.size, dtype=scaled_q.dtype))
+    """A stiffness above that of the potential, which is estimated at the guess.
+
+    `far` is the largest scaled coordinate.
+    """
+    no_springs = jnp.zeros_like(guess[0]), jnp.zeros_like(far)
+    along = jnp.cos(jnp.arange(guess[0].size, dtype=far.dtype))
     (force, _), (change, _) = jax.jvp(
         lambda x: balance((x, guess[1]), no_springs), (guess[0],), (along,)
     )
-    stiffness = largest(change) + largest(force) / (largest(scaled_q) + 1e-3)
+    stiffness = largest(change) + largest(force) / (far + 1e-3)
     return jnp.where(stiffness > 0, 16 * stiffness, 1)
 
 
 def _force_size(model: AbstractModel, guess: State) -> Scalar:
     """The size of the forces at the guess, as the root of an energy; a constant."""
     length = largest(guess.q * model.scales.coordinate)
-    size = jnp.maximum(largest(model.slope(guess) / model.scales.coordinate), length)
+    size = jnp.maximum(largest(model.slope(guess) / model.scales.step), length)
     return jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))

@@ -37,4 +37,6 @@ from ._motion import (
 from ._parameters import Parameters as Parameters
 from ._reactions import Reaction as Reaction
 from ._readouts import Readout as Readout
+from ._section_forces import SectionForces as SectionForces
 from .scene import Scene as Scene
+from .section import Section as Section

@@ -23,10 +23,13 @@ class AbstractBodyCoordinates(abc.ABC):
     - `num_coordinates`, `num_velocities`: of one body.
     - `num_internal`: constraints between its directors, which `System` adds.
     - `num_redundant`: relations between its coordinates whose rate vanishes for every `v`.
+    - `is_section`: whether these are the sections of beams, whose mass and inertia follow
+      from the numbers of the beams.
     """
 
     dimension: int
     turns: ClassVar[bool]
+    is_section: bool = False
     num_internal: ClassVar[int] = 0
     num_redundant: ClassVar[int] = 0
 
@@ -109,6 +112,7 @@ class PlanarBodies(AbstractBodyCoordinates):
     """`q`: mass centre and angle."""
 
     dimension: int = 2
+    is_section: bool = False
     turns = True
 
     @property
@@ -136,6 +140,7 @@ class DirectorBodies(AbstractBodyCoordinates):
     """`q`: mass centre and the three body axes, as vectors in space."""
 
     dimension: int = 3
+    is_section: bool = False
     turns = True
     num_internal = 6
 

@@ -1,6 +1,6 @@
 """Compiles a list of parts to a layout and its parameters."""
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from typing import Any
 
 import jax
@@ -11,18 +11,19 @@ from jaxtyping import Array
 from .._programs import compiled, is_known
 from .._types import Coordinates, Velocities
 from ._arguments import module_of, number
+from ._beam_geometry import weights_of
 from ._ends import Ends, Hinge, Hinges
 from ._frames import Frame, GROUND, Numbers
 from ._inerters import AbstractInerter
 from ._law_checks import resolved_part
 from ._laws import Flywheel, Gap
-from ._layout import Layout, Link, numbers_of
+from ._layout import BeamLink, Layout, LineLoadLink, Link, numbers_of
 from ._parameters import Parameters
 from ._pose_view import evaluate, lift, View
-from .bodies import AbstractBody
+from .bodies import AbstractBody, Beam
 from .contacts import AbstractContact
 from .drives import AbstractDrive
-from .forces import AbstractForce, Potential
+from .forces import AbstractForce, LineLoad, Potential
 from .joints import AbstractJoint, Constraint
 
 
@@ -35,7 +36,7 @@ def sort_parts(parts: Sequence[Any]) -> dict[type, list[Any]]:
     """The parts by their class, after checks of their names and dimensions."""
     kinds = (
         AbstractBody, AbstractJoint, AbstractForce, AbstractDrive, AbstractInerter,
-        AbstractContact, Constraint, Potential,
+        AbstractContact, Constraint, Potential, Beam, LineLoad,
     )  # fmt: skip
     found: dict[type, list[Any]] = {kind: [] for kind in kinds}
     if isinstance(parts, kinds):
@@ -61,6 +62,8 @@ def sort_parts(parts: Sequence[Any]) -> dict[type, list[Any]]:
             raise ValueError(f"There are two parts with the name '{part.name}'.")
         names.add(part.name)
         found[kind].append(part)
+        if isinstance(part, Beam):
+            found[AbstractBody] += part.nodes
     bodies = found[AbstractBody]
     if not bodies:
         raise ValueError("There is no body in the scene: nothing can move.")
@@ -82,9 +85,11 @@ def compile_parts(
 ) -> tuple[Layout, Parameters]:
     """The layout of sorted parts and its parameters; `own` are those of the user."""
     bodies = found[AbstractBody]
+    beams = {beam.name: beam for beam in found[Beam]}
+    loaded = [(load, _loaded_beam(load, beams)) for load in found[LineLoad]]
     named = tuple((body.name, body.kind) for body in bodies)
     rows = numbers_of(named)
-    ends = _StartPose(bodies, rows)
+    ends = _StartPose(bodies, rows, beams)
     resolved = {}
     for kind in LINKS:
         resolved[kind] = [(part, *resolved_part(part, ends(part))) for part in found[kind]]
@@ -110,6 +115,10 @@ def compile_parts(
         drives=links[AbstractDrive],
         inerters=links[AbstractInerter],
         contacts=links[AbstractContact],
+        beams=tuple(_beam_link(beam, rows) for beam in found[Beam]),
+        line_loads=tuple(
+            LineLoadLink(load.name, _rows_of_sections(beam, rows)) for load, beam in loaded
+        ),
     )
     tables = dict(
         bodies=_tables(layout.body_groups, {b.name: b.numbers for b in bodies}),
@@ -121,8 +130,31 @@ def compile_parts(
             _by_name(resolved[AbstractInerter]),
         ),
         contacts=_tables(layout.contact_groups, _by_name(resolved[AbstractContact])),
+        beams=_tables(layout.beam_groups, {x.name: x.numbers for x in found[Beam]}),
+        line_loads=_tables(
+            layout.line_load_groups,
+            {load.name: load.numbers(beam) for load, beam in loaded},
+        ),
     )
     return layout, Parameters(tables, _own(own, gravity, layout, tables), layout)
+
+
+def _beam_link(beam: Beam, rows: dict[str, int]) -> BeamLink:
+    weights = tuple(weights_of(np.array(beam.places)).tolist())
+    return BeamLink(beam.name, beam.law, _rows_of_sections(beam, rows), weights)
+
+
+def _rows_of_sections(beam: Beam, rows: dict[str, int]) -> tuple[int, ...]:
+    return tuple(rows[node.name] for node in beam.nodes)
+
+
+def _loaded_beam(load: LineLoad, beams: dict[str, Beam]) -> Beam:
+    if load.beam not in beams:
+        raise ValueError(
+            f"'{load.name}' acts on '{load.beam}', but there is no such beam. There are "
+            f"{[*beams]}."
+        )
+    return beams[load.beam]
 
 
 def _hinges(ends: "_StartPose", joints: list[tuple]) -> Hinges:
@@ -168,7 +200,9 @@ def _tables(groups: Sequence[Any], numbers: dict[str, Numbers]) -> tuple[Numbers
 class _StartPose:
     """Finds the bodies that a part connects, in the start pose."""
 
-    def __init__(self, bodies: Sequence[AbstractBody], rows: dict[str, int]):
+    def __init__(
+        self, bodies: Sequence[AbstractBody], rows: dict[str, int], beams: Container[str]
+    ):
         kinds = tuple((body.name, body.kind) for body in bodies)
         self._layout = Layout(
             dimension=bodies[0].kind.dimension,
@@ -179,7 +213,7 @@ class _StartPose:
             potentials=(),
             has_gravity=False,
         )
-        self._rows, self.hinges = rows, Hinges()
+        self._rows, self._beams, self.hinges = rows, beams, Hinges()
         q = join([body.q for body in bodies])
         frames = _all_frames(self._layout, jnp.asarray(q))
         self._frames = jax.device_get(frames) if is_known(frames) else frames
@@ -190,6 +224,12 @@ class _StartPose:
                 raise TypeError(
                     f"'{part.name}' connects bodies by their names, got a "
                     f"{type(body).__name__}: write '{getattr(body, 'name', '...')}'."
+                )
+            if body in self._beams:
+                raise ValueError(
+                    f"'{part.name}' connects '{body}', which is a beam: connect one of its "
+                    f"sections, '{body}:start' or '{body}:end', or one in between, "
+                    "`beam.at(arc_length)`."
                 )
             if body not in self._rows:
                 raise ValueError(

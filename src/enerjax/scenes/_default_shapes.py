@@ -51,7 +51,8 @@ def all_shapes(
     """
     points = _Points(layout, numbers)
     size = _size(points, layout, np.asarray(q))
-    heaviest = max(np.max(own["mass"]) for own in numbers["bodies"].values())
+    masses = [own["mass"] for own in numbers["bodies"].values() if "mass" in own]
+    heaviest = max((np.max(mass) for mass in masses), default=1.0)
     kinds, found = dict(layout.bodies), {}
     for name, shapes in given.items():
         own = numbers["bodies"].get(name, {})

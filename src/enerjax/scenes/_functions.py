@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from .._run import Impact
 from .._system import Names, RigidBodies, System
 from .._types import Coordinates, Multipliers, Scalar, Velocities
+from ._beam_functions import elastic_energy, energy_of_line_loads, numbers_of_bodies
 from ._laws import AbstractForceLaw, Acting, Driven, Gap
 from ._layout import Layout, Links
 from ._motion_view import Moving
@@ -77,7 +78,7 @@ def _restitution(layout: Layout, k: int, args: Parameters) -> Scalar:
 def kinetic(layout: Layout, v: Velocities, args: Parameters) -> Scalar:
     energies = [
         jnp.sum(jax.vmap(group.kind.kinetic)(rows(v, group.v), numbers))
-        for group, numbers in zip(layout.body_groups, args.tables["bodies"], strict=True)
+        for group, numbers in numbers_of_bodies(layout, args)
     ]
     groups = zip(layout.inerter_groups, args.tables["inerters"], strict=True)
     for group, numbers in groups:
@@ -93,6 +94,10 @@ def potential(layout: Layout, q: Coordinates, args: Parameters) -> Scalar:
     for group, numbers in zip(layout.force_groups, args.tables["forces"], strict=True):
         if not isinstance(group.law, AbstractForceLaw):
             energy = energy + jnp.sum(evaluate(group, view, numbers))
+    if layout.beams:
+        energy = energy + elastic_energy(layout, view, args)
+    if layout.line_loads:
+        energy = energy + energy_of_line_loads(layout, view, args)
     for name, function in layout.potentials:
         energy = energy + ask(name, function, view, args)
     return energy
@@ -101,8 +106,7 @@ def potential(layout: Layout, q: Coordinates, args: Parameters) -> Scalar:
 def _weight(view: View, args: Parameters) -> Scalar:
     """The work of gravity on all bodies, from the origin to their positions."""
     work = jnp.zeros((), view.q.dtype)
-    groups = view.layout.body_groups
-    for group, numbers in zip(groups, args.tables["bodies"], strict=True):
+    for group, numbers in numbers_of_bodies(view.layout, args):
         origins = jax.vmap(group.kind.origin)(rows(view.q, group.q))
         forces = numbers["mass"][:, None] * args["gravity"][None, :]
         work = work + jnp.sum(forces * origins)

@@ -372,3 +372,20 @@ class Following(Acting):
 
     def force(self, a: Frame, b: Frame, rate: Array, numbers: Numbers) -> Array:
         return b.direction(numbers["value"])
+
+
+@dataclass(frozen=True)
+class Turning(Acting):
+    """A torque in space, or in the axes of the body that it `follows`.
+
+    It acts on the axes: with the forces `torque x d_i / 2` and the rates `omega x d_i` the
+    power is `torque . omega`.
+    """
+
+    follows: bool
+
+    def force(self, a: Frame, b: Frame, rate: Array, numbers: Numbers) -> Array:
+        torque = numbers["value"]
+        if self.follows:
+            torque = b.direction(torque)
+        return 0.5 * jnp.cross(torque[None], b.axes).ravel()

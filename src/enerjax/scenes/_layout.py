@@ -11,6 +11,7 @@ from ._body_coordinates import AbstractBodyCoordinates
 from ._frames import GROUND
 from ._laws import AbstractForceLaw, AbstractNonholonomicLaw
 from ._measures import AbstractLaw
+from ._strains import AbstractStrains
 
 
 class Link(NamedTuple):
@@ -40,6 +41,39 @@ class Links(NamedTuple):
     b: np.ndarray
 
 
+class BeamLink(NamedTuple):
+    """A beam: the law of its strains, the rows of its sections in a table of frames, and
+    the parts of its mass that are in them."""
+
+    name: str
+    law: AbstractStrains
+    sections: tuple[int, ...]
+    weights: tuple[float, ...]
+
+
+class Beams(NamedTuple):
+    """All beams with the same law and as many elements; tables have a row for each."""
+
+    law: AbstractStrains
+    names: tuple[str, ...]
+    sections: np.ndarray
+    weights: np.ndarray
+
+
+class LineLoadLink(NamedTuple):
+    """A load on a beam, with the rows of the sections of the beam."""
+
+    name: str
+    sections: tuple[int, ...]
+
+
+class LineLoads(NamedTuple):
+    """All loads on beams of as many sections; `sections` has a row for each."""
+
+    names: tuple[str, ...]
+    sections: np.ndarray
+
+
 class Inerters(NamedTuple):
     """All inerters with the same law, and the index of the coordinate of each."""
 
@@ -67,6 +101,8 @@ class Layout:
     drives: tuple[Link, ...] = ()
     inerters: tuple[Link, ...] = ()
     contacts: tuple[Link, ...] = ()
+    beams: tuple[BeamLink, ...] = ()
+    line_loads: tuple[LineLoadLink, ...] = ()
 
     @cached_property
     def body_groups(self) -> tuple[Bodies, ...]:
@@ -120,6 +156,29 @@ class Layout:
             groups.append(Inerters(links, q + own, v + own))
         return tuple(groups)
 
+    @cached_property
+    def beam_groups(self) -> tuple[Beams, ...]:
+        members = _grouped(self.beams, lambda beam: (beam.law, len(beam.sections)))
+        return tuple(
+            Beams(
+                law,
+                tuple(beam.name for beam in beams),
+                np.array([beam.sections for beam in beams]),
+                np.array([beam.weights for beam in beams]),
+            )
+            for (law, _), beams in members
+        )
+
+    @cached_property
+    def line_load_groups(self) -> tuple[LineLoads, ...]:
+        return tuple(
+            LineLoads(
+                tuple(load.name for load in loads),
+                np.array([load.sections for load in loads]),
+            )
+            for _, loads in _grouped(self.line_loads, lambda load: len(load.sections))
+        )
+
     @property
     def has_constraints(self) -> bool:
         return bool(self.joints or self.constraints or self.inerters)
@@ -168,6 +227,8 @@ class Layout:
             drives=self.drive_groups,
             inerters=[group.links for group in self.inerter_groups],
             contacts=self.contact_groups,
+            beams=self.beam_groups,
+            line_loads=self.line_load_groups,
         )
         return {
             section: {

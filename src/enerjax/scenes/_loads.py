@@ -10,8 +10,8 @@ from .._types import Args, Real, Scalar, Vector
 from ._arguments import number
 from ._ends import Ends
 from ._frames import GROUND, Numbers
-from ._laws import Acting, Following, Viscous
-from ._measures import AbstractLaw, Place, Separation, turn_of
+from ._laws import Acting, Following, Turning, Viscous
+from ._measures import AbstractLaw, Orientation, Place, Separation, turn_of
 from ._part import AbstractForce
 from ._user_functions import takes_view
 
@@ -158,3 +158,44 @@ class Follower(AbstractForce):
         ends.only_bodies_that_turn()
         feedback = takes_view(self.name, "force", self.force)
         return Following(Place(), self.force, feedback), ends.point_of_body(self.point)
+
+
+class Torque(AbstractForce):
+    """A torque on a `body` in space that a function defines: `torque(t, args)`.
+
+    It is a vector in space, and it has no potential: what it does depends on the way. In
+    the plane use a `TorsionActuator` between the ground and the body. With feedback it is a
+    `torque(view, t, args)`; see `Actuator`.
+    """
+
+    torque: ForceFunction
+
+    def __init__(self, name: str, body: str, torque: ForceFunction):
+        self.name, self.a, self.b, self.torque = name, GROUND, body, torque
+
+    def __check_init__(self):
+        takes_view(self.name, "torque", self.torque)
+
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        return _turning(ends, self.name, self.torque, follows=False), {}
+
+
+class FollowerTorque(AbstractForce):
+    """A torque that turns with its `body`: a `Torque` in the axes of the body."""
+
+    torque: ForceFunction
+
+    def __init__(self, name: str, body: str, torque: ForceFunction):
+        self.name, self.a, self.b, self.torque = name, GROUND, body, torque
+
+    def __check_init__(self):
+        takes_view(self.name, "torque", self.torque)
+
+    def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
+        return _turning(ends, self.name, self.torque, follows=True), {}
+
+
+def _turning(ends: Ends, name: str, torque: ForceFunction, *, follows: bool) -> AbstractLaw:
+    ends.only_in_space("A torque about any axis")
+    ends.only_bodies_that_turn()
+    return Turning(Orientation(), torque, takes_view(name, "torque", torque), follows)

@@ -107,6 +107,17 @@ class Place(AbstractMeasure):
 
 
 @dataclass(frozen=True)
+class Orientation(AbstractMeasure):
+    """The components of all axes of the second body, in space."""
+
+    is_vector = True
+    reads = ("axes",)
+
+    def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Vector:
+        return b.axes.ravel()
+
+
+@dataclass(frozen=True)
 class PlanarTurn(AbstractMeasure):
     """The difference of two angles, over any number of turns."""
 

@@ -17,7 +17,7 @@ from ._laws import (
     Gap,
 )
 from ._layout import Layout, Links
-from ._measures import AbstractMeasure
+from ._measures import AbstractMeasure, Orientation
 from ._parameters import Parameters
 from ._pose_view import evaluate, lift, View
 
@@ -106,8 +106,9 @@ def measures_of(layout: Layout) -> dict[str, AbstractMeasure]:
         *layout.inerters,
         *layout.contacts,
     ):
-        if isinstance(link.law, _MEASURED) and link.law.measure is not None:
-            found[link.name] = link.law.measure
+        measure = link.law.measure if isinstance(link.law, _MEASURED) else None
+        if not (measure is None or isinstance(measure, Orientation)):
+            found[link.name] = measure
     return found
 
 

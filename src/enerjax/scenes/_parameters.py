@@ -75,6 +75,8 @@ def _like(old: Mapping[str, Any], key: str, value: Any) -> Any:
     new = jnp.asarray(value, old[key].dtype)
     if key == "inertia" and old[key].ndim == 2 and new.shape == (3,):
         new = jnp.diag(new)  # principal moments, as bodies take them
+    if key in ("GA", "EI") and new.shape == () and old[key].ndim == 1:
+        new = jnp.broadcast_to(new, old[key].shape)  # for both axes, as sections take them
     if new.shape != old[key].shape:
         raise ValueError(f"`{key}` has shape {old[key].shape}, got {new.shape}.")
     return new
@@ -119,7 +121,8 @@ class _Section(_ReadOnly):
         return _Part(jax.tree.map(lambda table: table[row], self._tables[group]))
 
     def __repr__(self) -> str:
-        return "\n".join(f"{name}: {part}" for name, part in self.items())
+        # Sections of beams have no numbers of their own.
+        return "\n".join(f"{name}: {part}" for name, part in self.items() if part)
 
 
 @jax.tree_util.register_pytree_node_class

@@ -45,9 +45,9 @@ def summary(
     width = max(len(name) for name in kinds)
     line = lambda name, text: f"  {name:{width}}  {kinds[name]:14}  {text}".rstrip()
     first = 0
-    for name, kind in bodies.items():
-        last = first + kind.num_coordinates
-        free = "" if name in joined else ", connected to nothing"
+    for name, sections in _with_beams(layout).items():
+        last = first + sum(bodies[section].num_coordinates for section in sections)
+        free = "" if joined & {*sections} else ", connected to nothing"
         lines.append(line(name, f"q[{first}:{last}]{free}"))
         first = last
     own = {link.name: first + k for k, link in enumerate(layout.inerters)}
@@ -60,6 +60,25 @@ def summary(
             slip = slips[name]
             between += f"nonholonomic[{slip.start}:{slip.stop}], "
         lines.append(line(name, between.removesuffix(", ")))
-    others = [name for name in kinds if name not in bodies and name not in rows]
+    shown = {*bodies, *rows, *(beam.name for beam in layout.beams)}
+    others = [name for name in kinds if name not in shown]
     lines += [line(name, " - ".join(ends.get(name, ()))) for name in others]
     return "\n".join(lines)
+
+
+def _with_beams(layout: Layout) -> dict[str, tuple[str, ...]]:
+    """The bodies of each part with coordinates: itself, or the sections of a beam."""
+    row_names = [*layout.numbers_of_bodies]
+    beams = {
+        row_names[beam.sections[0]]: (
+            beam.name, tuple(row_names[row] for row in beam.sections)
+        )
+        for beam in layout.beams
+    }  # fmt: skip
+    inner = {name for _, sections in beams.values() for name in sections[1:]}
+    found = {}
+    for name, _ in layout.bodies:
+        if name not in inner:
+            part, sections = beams.get(name, (name, (name,)))
+            found[part] = sections
+    return found

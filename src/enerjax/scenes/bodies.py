@@ -9,13 +9,10 @@ empty if the body is not to be seen. By default it follows from the joints and t
 see `docs/pictures.md`.
 """
 
-import abc
-from typing import Any
-
-import equinox as eqx
-
 from .._types import Real, Vector
 from ._arguments import joined, module_of, number, positive, velocities
+from ._beam import Beam as Beam
+from ._body import AbstractBody as AbstractBody
 from ._body_coordinates import (
     AbstractBodyCoordinates,
     DirectorBodies,
@@ -23,32 +20,9 @@ from ._body_coordinates import (
     Points,
     QuaternionBodies,
 )
-from ._frames import Numbers
 from ._part import only_parts
 from ._rotations import mass_and_inertia, quaternion_of, rotation_matrix
-from .shapes import AbstractShape, as_shapes, Capsule, Shape
-
-
-class AbstractBody(eqx.Module):
-    """A body of a scene.
-
-    - `numbers`: mass and inertia, the entries of `args["bodies"][name]`.
-    - `q`, `v`: its coordinates and velocities at the start.
-    - `prescribed`: which velocities the user has passed; the others are zeros.
-    - `shapes`: of pictures; `None` if the user has passed none.
-    """
-
-    name: str
-    numbers: Numbers
-    q: Any
-    v: Any
-    prescribed: tuple[bool, ...]
-    shapes: tuple[AbstractShape, ...] | None
-
-    @property
-    @abc.abstractmethod
-    def kind(self) -> AbstractBodyCoordinates:
-        """The functions of its coordinates."""
+from .shapes import as_shapes, Capsule, Shape
 
 
 class PointMass(AbstractBody):

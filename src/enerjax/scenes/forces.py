@@ -5,8 +5,13 @@ and loads have neither: their work is in `sol.audit.work`. Functions depend on t
 the `args` of the system.
 """
 
+import equinox as eqx
+import numpy as np
+
 from .._types import Real, Vector
-from ._arguments import number
+from ._arguments import module_of, number
+from ._beam import Beam
+from ._beam_geometry import weights_of
 from ._ends import Ends
 from ._frames import GROUND, Numbers
 from ._inerters import Inerter as Inerter, TorsionInerter as TorsionInerter
@@ -15,7 +20,9 @@ from ._loads import (
     Actuator as Actuator,
     Damper as Damper,
     Follower as Follower,
+    FollowerTorque as FollowerTorque,
     Load as Load,
+    Torque as Torque,
     TorsionActuator as TorsionActuator,
     TorsionDamper as TorsionDamper,
 )
@@ -111,6 +118,24 @@ class ConstantTorque(AbstractForce):
         ends.only_bodies_that_turn()
         torque = number(ends.part, "`torque`", self.torque, ())
         return Steady(PlanarTurn(), "torque"), dict(torque=torque)
+
+
+class LineLoad(eqx.Module):
+    """A force per length of a whole beam that is constant in space.
+
+    `force` has two or three entries (force per length); the length is that without stress.
+    """
+
+    name: str
+    beam: str
+    force: Vector
+
+    def numbers(self, beam: Beam) -> Numbers:
+        """The force, and the `length` on which it acts at each section."""
+        dimension = beam.nodes[0].kind.dimension
+        force = number(f"'{self.name}'", "`force`", self.force, (dimension,))
+        total = module_of(beam.numbers).sum(beam.numbers["length"])
+        return dict(force=force, length=total * weights_of(np.array(beam.places)))
 
 
 class Potential(AbstractFunctionOfPose):

@@ -26,6 +26,7 @@ from ._pose_view import View
 from ._reactions import each, Reaction, reaction
 from ._readouts import measured_along, Readout
 from ._row_index import check_reacting, row_names, rows_of, slips_of
+from ._section_forces import centreline, section_forces, SectionForces
 from ._start import check_poses, closed_start, gaps_of, PartialStart
 from ._summary import summary
 from .bodies import AbstractBody
@@ -216,11 +217,38 @@ class Scene:
         run are means over the step that ends at a row, and count as those of the row.
         """
         check_reacting(joint, self._rows, self._ends)
-        at_rest = isinstance(sol, ConsistentStart | Equilibrium)
-        ys = sol.state if at_rest else sol.ys
+        ys = self._ys(sol)
         args, ends = self.args if args is None else args, self._ends[joint]
         of_state = lambda q, x: reaction(self._layout, q, x, joint, ends, args)
         return each(of_state, ys.q, self.multipliers(sol, joint))
+
+    def section_forces(
+        self,
+        sol: Solution | ConsistentStart | Equilibrium | State,
+        beam: str,
+        args: Parameters | None = None,
+    ) -> SectionForces:
+        """The strains of a beam, and the forces and moments in its sections, along a run or
+        in one state.
+
+        Pass the `args` of the run if they are not those of the scene.
+
+        **Raises:** `ValueError` for what is no beam.
+        """
+        args = self.args if args is None else args
+        return section_forces(self._layout, self._ys(sol), beam, args)
+
+    def centreline(
+        self, sol: Solution | ConsistentStart | Equilibrium | State, beam: str
+    ) -> Array:
+        """The places of all sections of a beam, shape `(times, sections, d)` (length).
+
+        For one state it is `(sections, d)`. `scene.position(sol.ys, "arm:3")` and
+        `scene.direction` are those of one section.
+
+        **Raises:** `ValueError` for what is no beam.
+        """
+        return centreline(self._layout, self._ys(sol), beam)
 
     def motion(
         self,
@@ -448,6 +476,13 @@ class Scene:
             return self.mobility(start).degrees_of_freedom
         except ValueError:  # the joints cannot be closed
             return None
+
+    @staticmethod
+    def _ys(sol: Solution | ConsistentStart | Equilibrium | State) -> State:
+        if isinstance(sol, State):
+            return sol
+        at_rest = isinstance(sol, ConsistentStart | Equilibrium)
+        return sol.state if at_rest else sol.ys
 
     def _along(self, function: Any, ys: State) -> Array:
         return each(function, ys.q, ys.v)

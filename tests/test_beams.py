@@ -1,0 +1,415 @@
+"""Beams: statics, modes and motions of geometrically exact beams in scenes."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy
+
+import enerjax as ej
+
+from .helpers import EPS
+from .references import cantilever_by_shooting
+
+
+SOFT = ej.Section(EA=1e4, GA=1e4, EI=100.0, GJ=100.0, rhoA=1.0, rhoI=10.0)
+
+
+def _cantilever(axis, section, elements, *parts, **options):
+    beam = ej.bodies.Beam("beam", axis, section, elements, **options)
+    clamp = ej.joints.Fixed("clamp", "ground", beam.start)
+    return beam, ej.Scene([beam, clamp, *parts])
+
+
+# Statics ----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def in_plane():
+    """A function that bends a cantilever of four elements from a straight pose."""
+    beam, scene = _cantilever(
+        [[0.0, 0.0], [1.0, 0.0]],
+        SOFT,
+        4,
+        ej.forces.ConstantForce("force", "beam:end", [0.0, 0.0]),
+        ej.forces.ConstantTorque("torque", "beam:end", 0.0),
+    )
+    start = scene.start()
+
+    def solved(length, force=(0.0, 0.0), torque=0.0, **section):
+        elements = jnp.full((4,), length / 4)
+        unloaded = scene.args.set("beam", length=elements, **section)
+        args = unloaded.set("force", force=jnp.array(force)).set("torque", torque=torque)
+        # The straight beam of this length: the sections start where they are without loads.
+        q = start.q.reshape(5, 3) * jnp.array([[length, 1.0, 1.0]])
+        found = ej.equilibrium(
+            scene.system, ej.State(q.ravel(), start.v), args, from_args=unloaded, steps=10
+        )
+        moved = scene.position(found.state, beam.end) - jnp.array([length, 0.0])
+        return moved, scene.section_forces(found, "beam", args)
+
+    return solved
+
+
+def test_an_end_moment_rolls_a_beam_up(in_plane):
+    """Exact for any number of elements: `2 pi EI / L` closes a circle."""
+    moment = 2 * np.pi * 500.0 / 10
+    moved, inner = in_plane(10.0, torque=moment, EI=500.0)
+    np.testing.assert_allclose(moved, [-10.0, 0.0], atol=1e-11)  # solver
+    np.testing.assert_allclose(inner.moment, moment, rtol=1e-11)
+    np.testing.assert_allclose(inner.energies["bending"], moment**2 * 10 / 1e3, rtol=1e-11)
+    np.testing.assert_allclose(inner.arc_length, [1.25, 3.75, 6.25, 8.75])
+
+
+def test_a_thick_cantilever_has_the_digits_of_the_same_element(in_plane):
+    """Those of EXUDYN's two-node element with four elements."""
+    height, width, E, nu = 0.5, 0.1, 2.07e11, 0.3
+    section = ej.Section.rectangle(height, width, E=E, nu=nu, rho=1.0)
+    numbers = section.in_dimension("beam", 2)
+    stiffness = {key: numbers[key] for key in ("EA", "GA", "EI")}
+    moved, inner = in_plane(2.0, force=(0.0, -5e8 * height**3), **stiffness)
+    np.testing.assert_allclose(-moved, [0.14641168, 0.70292850], rtol=0, atol=1e-8)
+    # The force in the first element is the load in its axes.
+    load = jnp.linalg.norm(inner.force[0])
+    np.testing.assert_allclose(load, 5e8 * height**3, rtol=1e-9)
+
+
+def test_a_small_force_bends_and_shears_as_timoshenko_says(in_plane):
+    """The error of the elements is that of bending, a part `1/(4 n^2)` of it."""
+    length, EI, GA, force = 3.0, 3.07e3, 1.9e3, 1e-6
+    moved, _ = in_plane(length, force=(0.0, force), EA=2e5, GA=GA, EI=EI)
+    bending, shear = force * length**3 / (3 * EI), force * length / GA
+    expected = bending * (1 - 1 / (4 * 4**2)) + shear
+    np.testing.assert_allclose(moved[1], expected, rtol=1e-8)
+
+
+def test_load_steps_tell_how_far_they_came(in_plane):
+    with pytest.raises(ValueError, match="The part 0 of the way"):
+        in_plane(1.0, torque=1.0, EI=0.0)
+
+
+@pytest.mark.slow
+def test_bending_twists_a_beam_with_a_coupled_stiffness():
+    stiffness = np.diag([1368.17e3, 88.56e3, 38.78e3, 16.96e3, 59.12e3, 141.47e3])
+    stiffness[3, 4] = stiffness[4, 3] = 17.61e3
+    stiffness[3, 5] = stiffness[5, 3] = -0.351e3
+    stiffness[4, 5] = stiffness[5, 4] = -0.370e3
+    section = ej.Section(stiffness=stiffness, rhoA=1.0, rhoI=1.0)
+    load = ej.forces.ConstantForce("force", "beam:end", [0.0, 0.0, 150.0])
+    axis = [[0.0, 0.0, 0.0], [10.0, 0.0, 0.0]]
+    # Two codes agree on these digits for fine meshes.
+    published = [-9.02726627566299e-2, -6.47488486259036e-2, 1.22973648292371]
+    exact = cantilever_by_shooting(stiffness, 10.0, [0.0, 0.0, 150.0])
+    np.testing.assert_allclose(exact, published, rtol=1e-7)
+    moved = []
+    for elements in (8, 16):
+        beam, scene = _cantilever(axis, section, elements, load)
+        found = ej.equilibrium(scene.system, scene.start(), scene.args)
+        moved.append(scene.position(found.state, beam.end) - jnp.array(axis[1]))
+        inner = scene.section_forces(found, "beam")
+        potential = scene.system.potential_energy(found.state, scene.args)
+        work = 150.0 * moved[-1][2]
+        np.testing.assert_allclose(
+            sum(inner.energies.values()), potential + work, rtol=1e-9
+        )
+        force = scene.reaction(found, "clamp").force
+        np.testing.assert_allclose(force, [0.0, 0.0, -150.0], atol=1e-7)
+    # Of second order: extrapolated, the error is a hundredth of that of 16 elements.
+    np.testing.assert_allclose((4 * moved[1] - moved[0]) / 3, published, rtol=1e-4)
+
+
+def test_strains_do_not_see_rigid_motions():
+    _, scene = _cantilever([[0.0, 0.0, 0.0], [3.0, 0.0, 1.0]], SOFT, 3)
+    random = np.random.default_rng(1)
+    turned = scipy.spatial.transform.Rotation.from_rotvec(random.normal(size=(4, 3)))
+    q = np.asarray(scene.q).reshape(4, 4, 3) + 0.1 * random.normal(size=(4, 4, 3))
+    q[:, 1:] = np.swapaxes(turned.as_matrix(), 1, 2)
+    rotation = scipy.spatial.transform.Rotation.from_rotvec([0.4, -2.0, 1.1]).as_matrix()
+    moved = q @ rotation.T
+    moved[:, 0] += np.array([3.0, -2.0, 5.0])
+    a, b = (scene.section_forces(ej.State(x.ravel(), scene.v), "beam") for x in (q, moved))
+    np.testing.assert_allclose(b.strain, a.strain, rtol=0, atol=100 * EPS)
+    np.testing.assert_allclose(b.curvature, a.curvature, rtol=0, atol=100 * EPS)
+    # The curvature is the rotation vector between the sections, over the length.
+    relative = (turned[:-1].inv() * turned[1:]).as_rotvec()
+    length = scene.args["beams"]["beam"]["length"][0]
+    assert np.abs(relative).max() > 1
+    np.testing.assert_allclose(a.curvature, relative / length, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_statics_in_space_meet_a_shooting_method():
+    """The Princeton beam experiment; the error of the elements is of second order."""
+    height, width = 12.3777e-3, 3.2024e-3
+    second = height * width * (height**2 + width**2) / 12
+    section = ej.Section.rectangle(
+        height, width, E=71.7e9, nu=0.31, rho=1.0, shear_factor=1.0,
+        torsion_constant=0.198 * second,
+    )  # fmt: skip
+    angle = np.radians(30.0)
+    force = 13.345 * np.array([0.0, -np.cos(angle), np.sin(angle)])
+    numbers = section.in_dimension("beam", 3)
+    stiffness = np.diag(
+        np.concatenate([[numbers["EA"]], numbers["GA"], [numbers["GJ"]], numbers["EI"]])
+    )
+    exact = cantilever_by_shooting(stiffness, 0.508, force)
+    errors = []
+    for elements in (8, 16):
+        load = ej.forces.ConstantForce("force", "beam:end", force)
+        beam, scene = _cantilever([[0, 0, 0], [0.508, 0, 0]], section, elements, load)
+        unloaded = scene.args.set("force", force=jnp.zeros(3))
+        found = ej.equilibrium(
+            scene.system, scene.start(), scene.args, from_args=unloaded, steps=5
+        )
+        moved = scene.position(found.state, beam.end) - np.array([0.508, 0, 0])
+        errors.append(np.abs(moved - exact).max())
+    assert errors[1] < 2e-4
+    assert 3.7 < errors[0] / errors[1] < 4.3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("law", [ej.forces.Torque, ej.forces.FollowerTorque])
+def test_end_moments_roll_a_beam_up_in_space(law):
+    torque = law("torque", "beam:end", lambda t, args: args["moment"] * jnp.eye(3)[2])
+    beam = ej.bodies.Beam("beam", [[0, 0, 0], [10.0, 0, 0]], SOFT, 6)
+    clamp = ej.joints.Fixed("clamp", "ground", beam.start)
+    scene = ej.Scene([beam, clamp, torque], args={"moment": 20 * np.pi})
+    found = ej.equilibrium(
+        scene.system, scene.start(), scene.args, from_args=scene.args.set(moment=0.0),
+        steps=10,
+    )  # fmt: skip
+    np.testing.assert_allclose(scene.position(found.state, beam.end), 0.0, atol=1e-10)
+
+
+# Motions ----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def spaghetti():
+    """J. C. Simo and L. Vu-Quoc's flying beam in the plane, until after its loads."""
+    beam = ej.bodies.Beam("beam", [[0.0, 8.0], [6.0, 0.0]], SOFT, 16)
+    on = lambda t: jnp.where(t < 2.5, 1.0, 0.0)
+    scene = ej.Scene(
+        [
+            beam,
+            ej.forces.Load("push", beam.end, lambda t, args: jnp.stack([8 * on(t), 0 * t])),
+            ej.forces.TorsionActuator(
+                "turn", "ground", beam.end, lambda t, args: -80 * on(t)
+            ),
+        ]
+    )
+    system, start, args = scene.build()
+    sol = ej.simulate(system, ej.EnergyPreserving(), start, args, h=0.01, num_steps=300)
+    return beam, scene, sol
+
+
+def test_a_flying_beam_keeps_its_balances(spaghetti):
+    _, scene, sol = spaghetti
+    size = float(jnp.abs(sol.audit.energy).max())
+    np.testing.assert_allclose(sol.audit.leak, 0.0, atol=1e3 * EPS * size)  # round-off
+    first = np.array([3 / 8, 7 / 6, 23 / 24])  # of Gregory's quadrature
+    weights = np.concatenate([first, np.ones(11), first[::-1]]) / 16
+    middle = jnp.einsum("n,tni->ti", weights, scene.centreline(sol, "beam"))
+    t = sol.ts
+    x = jnp.where(t < 2.5, 3 + 0.4 * t**2, 5.5 + 2 * (t - 2.5))
+    np.testing.assert_allclose(middle, jnp.stack([x, 0 * t + 4], axis=1), atol=1e-11)
+
+
+def test_a_flying_beam_moves_as_published(spaghetti):
+    """Displacements of a spectral solution; the error is that of 16 elements."""
+    beam, scene, sol = spaghetti
+    place = lambda name, k: scene.position(sol.ys, name)[k]
+    moved = lambda name, k: place(name, k) - place(name, 0)
+    np.testing.assert_allclose(moved(beam.end, 100), [-1.6730, 0.4077], atol=0.03)
+    np.testing.assert_allclose(moved(beam.start, 100), [0.3702, -0.2040], atol=0.01)
+    np.testing.assert_allclose(moved(beam.start, 250), [3.583, -1.888], atol=0.02)
+
+
+@pytest.fixture(scope="module")
+def free():
+    """A free beam in space that tumbles and vibrates."""
+    section = ej.Section(EA=1e4, GA=1e4, EI=[100.0, 50.0], GJ=40.0, rhoA=1.0, rhoI=0.1)
+    beam = ej.bodies.Beam(
+        "beam", [[0, 0, 0], [3.0, 0, 4.0]], section, 4, velocity=[1.0, 0, 0],
+        angular_velocity=[0.5, 1.0, 0.2],
+    )  # fmt: skip
+    scene = ej.Scene([beam])
+    start = scene.start()
+    tip = start.v.reshape(-1, 12).at[-1, 0].add(2.0)
+    return scene, ej.State(start.q, tip.ravel())
+
+
+def _momenta(scene, sol):
+    """Momentum, and angular momentum about the origin."""
+    q, v = (x.reshape(len(sol.ts), -1, 4, 3) for x in (sol.ys.q, sol.ys.v))
+    numbers = scene.args["beams"]["beam"]
+    parts = np.array([3 / 8, 7 / 6, 11 / 12, 7 / 6, 3 / 8]) / 4  # of four elements
+    own = jnp.asarray(parts) * jnp.sum(numbers["length"])
+    second = 0.5 * jnp.trace(numbers["rhoI"]) * jnp.eye(3) - numbers["rhoI"]
+    momentum = numbers["rhoA"] * own[None, :, None] * v[:, :, 0]
+    halves = np.array([0.5, 1, 1, 1, 0.5]) / 4 * jnp.sum(numbers["length"])
+    spin = jnp.einsum("n,ij,tnia->tnja", halves, second, v[:, :, 1:])
+    turning = jnp.cross(q[:, :, 1:], spin).sum(axis=2)
+    angular = jnp.cross(q[:, :, 0], momentum) + turning
+    return momentum.sum(axis=1), angular.sum(axis=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "scheme", [ej.EnergyPreserving(), ej.Composed(ej.EnergyPreserving(), 4)]
+)
+def test_a_free_beam_in_space_keeps_energy_and_momenta(free, scheme):
+    scene, start = free
+    sol = ej.simulate(scene.system, scheme, start, scene.args, h=0.02, num_steps=200)
+    for found in (sol.audit.energy, *_momenta(scene, sol)):
+        size = float(jnp.abs(found).max())
+        assert float(jnp.abs(found - found[:1]).max()) < 2e3 * EPS * size  # round-off
+
+
+@pytest.mark.slow
+def test_a_decaying_scheme_damps_a_free_beam(free):
+    scene, start = free
+    sol = ej.simulate(
+        scene.system, ej.EnergyDecaying(1.0), start, scene.args, h=0.02, num_steps=200
+    )
+    energy = sol.audit.energy
+    assert float(jnp.diff(energy).max()) <= 1e3 * EPS * float(energy[0])
+    assert float(energy[-1]) < 0.97 * float(energy[0])
+    np.testing.assert_allclose(sol.audit.leak, 0.0, atol=1e3 * EPS * float(energy[0]))
+
+
+@pytest.mark.slow
+def test_the_stiffness_of_a_beam_has_gradients():
+    def tip(EI):
+        beam, scene = _cantilever([[0.0, 0.0], [1.0, 0.0]], SOFT, 4)
+        scene = ej.Scene(
+            [beam, ej.joints.Fixed("clamp", "ground", beam.start)], gravity=[0.0, -5.0]
+        )
+        args = scene.args.set("beam", EI=EI)
+        sol = ej.simulate(
+            scene.system, ej.EnergyPreserving(), scene.start(), args, h=0.02, num_steps=20
+        )
+        return scene.position(sol.ys, beam.end)[-1, 1]
+
+    slope = jax.grad(tip)(2.0)
+    difference = (tip(2.0 + 1e-4) - tip(2.0 - 1e-4)) / 2e-4
+    np.testing.assert_allclose(slope, difference, rtol=1e-6)
+
+
+# Modes ------------------------------------------------------------------------------------
+
+
+def test_axial_vibrations_of_a_clamped_beam():
+    """The error is that of the elements, `(k l)^2 / 24` for the wave number `k`."""
+    section = ej.Section(EA=80.0, GA=30.0, EI=4.0, rhoA=2.0, rhoI=0.1)
+    _, scene = _cantilever([[0.0, 0.0], [0.0, 2.0]], section, 10)
+    found = ej.modes(scene.system, scene.start(), scene.args).frequencies
+    exact = np.pi / 4 * np.sqrt(80.0 / 2.0)
+    error = (np.pi / 4 * 0.2) ** 2 / 24
+    nearest = found[jnp.argmin(jnp.abs(found - exact))]
+    assert float(jnp.abs(nearest / exact - 1)) == pytest.approx(error, rel=0.2)
+
+
+def test_a_straight_beam_has_the_inertia_of_a_rod():
+    """Whatever the places of its sections: mass, mass centre and moment of inertia."""
+    section = ej.Section(EA=1.0, GA=1.0, EI=1.0, rhoA=3.0, rhoI=0.1)
+    for elements in (2, 3, 7, [0.0, 0.1, 0.25, 0.45, 0.7, 1.0]):
+        beam = ej.bodies.Beam(
+            "beam", [[0.0, 0.0], [2.0, 0.0]], section, elements, angular_velocity=2.0
+        )
+        scene = ej.Scene([beam], gravity=[1.0, 0.0])
+        state = ej.State(scene.q, scene.v)
+        kinetic = scene.system.kinetic_energy(state, scene.args)
+        np.testing.assert_allclose(kinetic, 2 * (6.0 * 2**2 / 12 + 0.1 * 2), rtol=1e-13)
+        potential = scene.system.potential_energy(state, scene.args)
+        np.testing.assert_allclose(potential, -6.0 * 1.0, rtol=1e-13)
+
+
+# Curves, sections and bad input -----------------------------------------------------------
+
+
+def test_a_curved_beam_has_sections_at_equal_arc_lengths():
+    """A helix in a parametrisation of its own; its curvature and torsion are constant."""
+    radius, pitch, turns = 2.0, 1.0, 0.75
+
+    def helix(u):
+        angle = 2 * jnp.pi * turns * (u + u**2) / 2
+        return jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), pitch * angle])
+
+    beam = ej.bodies.Beam("helix", helix, SOFT, 24, normal=[-1.0, 0.0, 0.0], twist=0.3)
+    total = 2 * np.pi * turns * np.hypot(radius, pitch)
+    np.testing.assert_allclose(beam.numbers["length"], total / 24, rtol=1e-10)
+    bent = np.linalg.norm(beam.numbers["reference"][:, 4:], axis=1)
+    squared = radius**2 + pitch**2
+    np.testing.assert_allclose(bent, radius / squared, rtol=0.01)  # truncation
+    # Without the twist, sections do not turn about the tangent.
+    np.testing.assert_allclose(beam.numbers["reference"][:, 3], 0.3 / total, atol=1e-3)
+    axes = np.array([node.q for node in beam.nodes]).reshape(-1, 4, 3)[:, 1:]
+    products = np.einsum("nik,njk->nij", axes, axes)
+    np.testing.assert_allclose(products - np.eye(3)[None], 0.0, atol=1e-13)
+    assert beam.at(total / 2) == beam.node(12) == "helix:12"
+
+
+def test_sections_of_a_material():
+    tube = ej.Section.tube(0.3, 0.2, E=7.0, nu=0.25, rho=2.0).numbers
+    area, moment = np.pi * (0.3**2 - 0.2**2), np.pi / 4 * (0.3**4 - 0.2**4)
+    assert tube["EA"] == pytest.approx(7 * area)
+    assert tube["GJ"] == pytest.approx(2.8 * 2 * moment)
+    np.testing.assert_allclose(tube["EI"], 7 * moment)
+    square = ej.Section.rectangle(0.4, 0.4, E=1.0, nu=0.0, rho=1.0).numbers
+    # S. Timoshenko and J. Goodier: 0.1406 a^4 for a square.
+    assert square["GJ"] / 0.5 / 0.4**4 == pytest.approx(0.140577, abs=1e-6)
+    assert square["GA"] == pytest.approx(10 / 12 * 0.5 * 0.16)
+
+
+_PAIR = [[0.0, 0.0], [1.0, 0.0]]
+_IN_SPACE = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
+_FLAT = dict(rhoA=1.0, rhoI=1.0)
+_NO_SECTION: Any = 3.0
+_BEAM = ej.bodies.Beam("arm", _PAIR, SOFT, 4)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: ej.Section(EA=1.0, EI=1.0, **_FLAT), "needs `GA`"),
+        (lambda: ej.Section(EA=-1.0, GA=1.0, EI=1.0, **_FLAT), "`EA` .* positive"),
+        (lambda: ej.Section(EA=1.0, GA=1.0, EI=0.0, **_FLAT), "`EI` .* positive"),
+        (lambda: ej.Section(EA=1.0, GA=1.0, EI=1.0, rhoA=1.0, rhoI=0.0), "rhoI"),
+        (lambda: ej.Section(stiffness=np.diag([1.0, 1, -1]), **_FLAT), "not positive def"),
+        (lambda: ej.Section(stiffness=np.eye(3), EA=1.0, **_FLAT), "in place of"),
+        (lambda: ej.bodies.Beam("x", [[1.0, 2]] * 2, SOFT), "coincide"),
+        (lambda: ej.bodies.Beam("x", _PAIR, SOFT, 0), "at least one element"),
+        (lambda: ej.bodies.Beam("x", _PAIR, SOFT, [0, 0.6, 0.5, 1]), "must increase"),
+        (lambda: ej.bodies.Beam("x", _PAIR, _NO_SECTION), "must be an `ej.Section`"),
+        (lambda: ej.bodies.Beam("x", _PAIR, SOFT, twist=1.0), "in the plane"),
+        (
+            lambda: ej.bodies.Beam("x", _IN_SPACE, ej.Section(EA=1, GA=1, EI=1, **_FLAT)),
+            "needs `GJ`",
+        ),
+        (lambda: ej.bodies.Beam("x", _IN_SPACE, SOFT, normal=[2.0, 0, 0]), "across"),
+        (
+            lambda: ej.bodies.Beam(
+                "x", lambda u: jnp.stack([jnp.cos(6.28 * u), jnp.sin(6.28 * u)]), SOFT, 1
+            ),
+            "turn by 360 degrees",
+        ),
+        (lambda: ej.bodies.Beam("x", lambda u: jnp.stack([u**2, u]) * u, SOFT), "still"),
+        (lambda: _BEAM.at(1.1), "not on 'arm'"),
+        (lambda: _BEAM.at(0.3), "nearest is at 0.25"),
+        (
+            lambda: ej.Scene([_BEAM, ej.joints.Fixed("clamp", "ground", "arm")]),
+            "'arm:start' or 'arm:end'",
+        ),
+        (
+            lambda: ej.Scene([_BEAM, ej.forces.LineLoad("wind", "leg", [0.0, 1.0])]),
+            "no such beam",
+        ),
+        (lambda: ej.Scene([_BEAM]).centreline(ej.State([0.0], [0.0]), "leg"), "no beam"),
+    ],
+)  # fmt: skip
+def test_bad_input_raises_one_error(call, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        call()
