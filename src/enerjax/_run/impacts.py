@@ -199,19 +199,6 @@ class Impacts(eqx.Module):
         e = self.restitutions(model.args, state.q.dtype)
         corrections = 8 if isinstance(model.system, HamiltonianSystem) else 1
         constant = jax.lax.stop_gradient
-        is_alone = len(self.impacts) == 1
-
-        def moved(
-            q: Coordinates, v: Velocities, held: Resting | None, shift: Scalar
-        ) -> tuple[Coordinates, Velocities]:
-            """The state after the time `shift`, to first order."""
-            if is_alone:
-                return q, v
-            inner = model if held is None else with_resting(model, held)
-            here = State(q, v, state.t)
-            rates = inner.lift(q, v), inner.accelerations(here)[0]
-            qdot, vdot = constant(rates)
-            return q + shift * qdot, v + shift * vdot
 
         def hit(carry: tuple, k: Array) -> tuple[tuple, None]:
             q, v, resting = carry
@@ -219,28 +206,10 @@ class Impacts(eqx.Module):
             gap, rate = self.gaps(q, model.args)[k], self.rates(model, at)[k]
             is_hit = happens[k] & (rate < 0)
             shift = (constant(gap) - gap) / constant(jnp.where(is_hit, rate, 1.0))
-            q, v = moved(q, v, resting, shift)
+            q, v = self._moved(model, at, resting, shift)
             rates = lambda v: self.rates(model, State(q, v, state.t))
             rate, slope = rates(v)[k], jax.grad(lambda v: rates(v)[k])(v)
-            weight = model.inverse_regular_metric(State(q, v, state.t))
-
-            def by_unit_impulse(held: Resting | None) -> Velocities:
-                inner = model if held is None else with_resting(model, held)
-                pushed = State(q, v + weight @ slope, state.t)
-                return project_velocity(inner, pushed, ())[0] - v
-
-            if resting is None:
-                pressed, change = None, by_unit_impulse(None)
-            else:
-                # A closed gap transmits the impact if this presses it, and opens if not.
-                def press(held: Resting, _: None) -> tuple[Resting, tuple]:
-                    change = by_unit_impulse(held)
-                    moves = jax.jvp(rates, (v,), (change,))[1]
-                    return jnp.where(moves < 0, resting, 0.0), (held, change)
-
-                none = jnp.zeros_like(resting)
-                _, tried = jax.lax.scan(press, none, None, length=2)
-                pressed, change = jax.tree.map(lambda x: x[-1], tried)
+            pressed, change = self._push(model, State(q, v, state.t), slope, resting)
 
             def correct(impulse: Scalar, _: None) -> tuple[Scalar, None]:
                 off = -e[k] * rate - rates(v + impulse * change)[k]
@@ -248,7 +217,8 @@ class Impacts(eqx.Module):
 
             none = jnp.zeros_like(rate)
             impulse, _ = jax.lax.scan(correct, none, None, length=corrections)
-            q, v = moved(q, v + impulse * change, pressed, -shift)
+            after = State(q, v + impulse * change, state.t)
+            q, v = self._moved(model, after, pressed, -shift)
             choose = lambda x, y: jnp.where(is_hit, x, y)
             return jax.tree.map(choose, (q, v, pressed), carry), None
 
@@ -259,6 +229,42 @@ class Impacts(eqx.Module):
         eps, speed = jnp.finfo(q.dtype).eps, jnp.max(jnp.abs(self.rates(model, state)))
         closes = happens & (self.rates(model, end) < -1e3 * eps * speed)
         return end, resting, closes
+
+    def _moved(
+        self, model: AbstractModel, state: State, held: Resting | None, shift: Scalar
+    ) -> tuple[Coordinates, Velocities]:
+        """Positions and velocities after the time `shift`, to first order."""
+        if len(self.impacts) == 1:
+            return state.q, state.v
+        inner = model if held is None else with_resting(model, held)
+        rates = inner.lift(state.q, state.v), inner.accelerations(state)[0]
+        qdot, vdot = jax.lax.stop_gradient(rates)
+        return state.q + shift * qdot, state.v + shift * vdot
+
+    def _push(
+        self, model: AbstractModel, state: State, slope: Velocities, resting: Resting | None
+    ) -> tuple[Resting | None, Velocities]:
+        """The gaps that stay closed in a hit, and the change of the velocities by a unit
+        impulse along `slope`."""
+        pushed = state.v + model.inverse_regular_metric(state) @ slope
+
+        def change_with(held: Resting | None) -> Velocities:
+            inner = model if held is None else with_resting(model, held)
+            after = project_velocity(inner, State(state.q, pushed, state.t), ())[0]
+            return after - state.v
+
+        if resting is None:
+            return None, change_with(None)
+        rates = lambda v: self.rates(model, State(state.q, v, state.t))
+
+        # A closed gap transmits the impact if this presses it, and opens if not.
+        def press(held: Resting, _: None) -> tuple[Resting, tuple]:
+            change = change_with(held)
+            moves = jax.jvp(rates, (state.v,), (change,))[1]
+            return jnp.where(moves < 0, resting, 0.0), (held, change)
+
+        _, tried = jax.lax.scan(press, jnp.zeros_like(resting), None, length=2)
+        return jax.tree.map(lambda x: x[-1], tried)
 
     def consistent(
         self,

@@ -200,15 +200,9 @@ def attempt_with_events(
     verdict = _judged(stepper, watcher, before, out, length, found)
     happens = found.happens & live & verdict.accepted
     t = plan.time(place)
-    usual = plan.unit * plan.usual(before.memory)
-    changed = watcher.after(
-        model,
-        out.state,
-        t,
-        happens,
-        watcher.rest(watch, usual, plan.least_hop),
-        lambda user, args: model_for(stepper.scheme, model.system, user, args),
-    )
+    rest = watcher.rest(watch, plan.unit * plan.usual(before.memory), plan.least_hop)
+    remade = lambda user, args: model_for(stepper.scheme, model.system, user, args)
+    changed = watcher.after(model, out.state, t, happens, rest, remade)
     later = eqx.combine(changed.varying, model)
     failure = RESULTS.where(verdict.accepted, changed.result, RESULTS.successful)
     failure = first_failure(
