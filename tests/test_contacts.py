@@ -106,6 +106,7 @@ def test_step_refuses_a_system_with_events():
         ej.step(system, ej.EnergyPreserving(), start, args, h=0.01)
 
 
+@pytest.mark.slow
 def test_the_restitution_of_a_contact_is_found_from_bounces():
     system, start, args = ej.Scene(
         [

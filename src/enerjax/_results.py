@@ -65,13 +65,21 @@ class RESULTS(eqx.Enumeration):
         "before, or lengthen the run only to where they accumulate."
     )
     gap_closed_at_start = (
-        "The gap of an `Impact` is negative at the start, or it is zero and closes. Start "
-        "with open gaps, or with gaps that are zero and at rest."
+        "The gap of an `Impact` is negative at the start, or it is zero and does not open. "
+        "Start with open gaps, or with gaps that are zero and at rest and have a "
+        "restitution below 1: after elastic impacts nothing rests."
     )
     impacts_unresolved = (
-        "After impacts that happened at once, a gap still closes, or closed gaps keep "
-        "changing. Impacts are applied one after another: change their order, or let them "
-        "happen one by one."
+        "After an event the gap of an `Impact` is negative or still closes. Either a reset "
+        "has closed it, or impacts happened at once that do not end if they are applied "
+        "one after another: change their order, or let them happen one by one."
+    )
+    inconsistent_reset = (
+        "After a `reset` or `reset_args` of an event the state does not satisfy the "
+        "constraints. It must do so in positions and velocities, with the new `args`."
+    )
+    restitution_out_of_range = (
+        "The restitution of an `Impact` is not between 0 and 1 for these `args`."
     )
     interrupted = (
         "The run was interrupted. The same call with `resume=solution`, or with the same "
@@ -94,6 +102,8 @@ _NAMES = (
     "too_many_events",
     "gap_closed_at_start",
     "impacts_unresolved",
+    "inconsistent_reset",
+    "restitution_out_of_range",
     "interrupted",
 )
 

@@ -167,6 +167,10 @@ class _ControlledPlan(AbstractPlan):
     def usual(self, memory: _Memory) -> Scalar:
         return memory.length
 
+    @property
+    def least_hop(self) -> Scalar:
+        return self.controller.rtol.astype(self.unit.dtype)
+
     def after_event(
         self,
         old: _Memory,

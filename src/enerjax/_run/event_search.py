@@ -35,8 +35,9 @@ class Watch(eqx.Module):
 
     - `side`: the sign that each function has before its next zero.
     - `values`: of all functions.
-    - `sizes`: the largest absolute values so far, of the functions of the user in the first
-      row, and of the forces of closed gaps in the second.
+    - `sizes`: the largest absolute values of late, in the first row of the functions of the
+      user and in the second of the forces of closed gaps. Each step halves older ones.
+    - `largest`: the largest absolute values of the functions of the user so far.
     - `is_force`: for which events the function is the force of a closed gap.
     - `starts`: which functions are zero and move to their side.
     - `search`: the interval of lengths that encloses the first zero in the step.
@@ -47,6 +48,7 @@ class Watch(eqx.Module):
     side: Float[Array, " events"]
     values: Float[Array, " events"]
     sizes: Float[Array, "2 events"]
+    largest: Float[Array, " events"]
     is_force: Bool[Array, " events"]
     starts: Bool[Array, " events"]
     search: "Search"
@@ -54,7 +56,7 @@ class Watch(eqx.Module):
     ended: Flag
 
     def sizes_with(self, values: Array, is_force: Array) -> Float[Array, "2 events"]:
-        """The sizes of all values so far and of these."""
+        """The sizes of late with those of these values."""
         size = jnp.where(jnp.isfinite(values), jnp.abs(values), 0.0)[None]
         here = jnp.stack([~is_force, is_force])
         return jnp.where(here, jnp.maximum(self.sizes, size), self.sizes)

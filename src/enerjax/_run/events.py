@@ -61,9 +61,9 @@ class Event(AbstractEvent):
     - `reset`: a function `reset(q, v, t, args)` that returns the pair `(q, v)` after the
       event. It must satisfy the constraints. Leave it out if the state does not change.
     - `reset_args`: a function `reset_args(q, v, t, args)` that returns the `args` after the
-      event: a latch that opens, a law that switches. Shapes and types stay the same, and
-      so must the numbers that are part of the program, such as integers. It is called
-      with the state before the event. Leave it out if `args` do not change.
+      event: a latch that opens, a law that switches. Only floats can change, and the state
+      must satisfy the constraints for the new ones. It is called with the state before the
+      event. Leave it out if `args` do not change.
 
     **Raises:** `TypeError` for what is no function; `ValueError` for another direction.
     """
@@ -93,13 +93,21 @@ class Event(AbstractEvent):
             raise ValueError(
                 f"The function `fn` of an `Event` must return a scalar, got {value.shape}."
             )
+        if not jnp.issubdtype(value.dtype, jnp.floating):
+            raise TypeError(
+                "The function `fn` of an `Event` must return a float that passes zero, got "
+                f"{value.dtype}: write `q[0] - 0.5` in place of `q[0] < 0.5`."
+            )
         return value
 
     def state_after(self, state: State, t: Scalar, args: Args) -> State:
         """The user's state after the event."""
         if self.reset is None:
             return state
-        q, v = (jnp.asarray(x) for x in self.reset(state.q, state.v, t, args))
+        after = self.reset(state.q, state.v, t, args)
+        if not isinstance(after, tuple) or len(after) != 2:
+            raise TypeError(f"`reset` must return the pair (q, v), got {after!r}.")
+        q, v = (jnp.asarray(x) for x in after)
         if (q.shape, v.shape) != (state.q.shape, state.v.shape):
             raise ValueError(
                 f"`reset` must return (q, v) of the shapes {state.q.shape} and "
@@ -108,10 +116,9 @@ class Event(AbstractEvent):
         return State(q.astype(state.q.dtype), v.astype(state.v.dtype))
 
     def args_after(self, state: State, t: Scalar, args: Args) -> Args:
-        """The `args` after the event; only their inexact arrays may be others."""
+        """The `args` after the event; only floats may be others."""
         if self.reset_args is None:
             return args
-        old, rest = eqx.partition(args, eqx.is_inexact_array)
         new = self.reset_args(state.q, state.v, t, args)
         if jax.tree.structure(new) != jax.tree.structure(args):
             raise ValueError(
@@ -120,6 +127,13 @@ class Event(AbstractEvent):
             )
 
         def changed(x: Any, y: Any) -> Any:
+            if not eqx.is_inexact_array(x):
+                if x is y or (is_known((x, y)) and np.array_equal(x, y)):
+                    return x
+                raise TypeError(
+                    f"`reset_args` changes {x!r}, which is no float. Only floats can "
+                    "change in a run: write 1.0 and 0.0, for example, for a latch."
+                )
             y = jnp.asarray(y)
             if y.shape != x.shape:
                 raise ValueError(
@@ -127,11 +141,7 @@ class Event(AbstractEvent):
                 )
             return y.astype(x.dtype)
 
-        is_none = lambda x: x is None
-        numbers = jax.tree.map(
-            lambda x, y: None if x is None else changed(x, y), old, new, is_leaf=is_none
-        )
-        return eqx.combine(numbers, rest)
+        return jax.tree.map(changed, args, new)
 
 
 class Impact(AbstractEvent):
@@ -142,11 +152,14 @@ class Impact(AbstractEvent):
     constraint. The energy changes by `-(1 - restitution^2)/2 rate_before^2 / w` with the
     inverse inertia `w` along the gradient, on the constraints; the audit counts the loss as
     `impact`. Impacts that happen at once are applied one after another, in their order,
-    until all of these gaps open.
+    until none of these gaps closes any more. In a driven mechanism `impact` includes the
+    work that the drives do during the hit.
 
-    A gap stays closed if its next hit would follow within the length of a step: its rate is
-    then set to zero, and it is a constraint until its force would pull. Bounces that become
-    ever shorter thus end. Elastic impacts (`restitution` 1, not traced) never stay closed.
+    A gap stays closed if its next hit would follow within the length of a step, and if the
+    hop until then would be lower than a thousandth of the largest gap before (with a
+    `StepController`, than the part `rtol` of it). Its rate is then set to zero, and it is a
+    constraint until its force would pull. Bounces that become ever shorter thus end. After
+    elastic impacts, with a `restitution` written as the number 1, no gap stays closed.
 
     **Arguments:**
 

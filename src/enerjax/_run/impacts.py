@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 from .._analysis import project_velocity
 from .._operators import AbstractModel
 from .._programs import is_known
+from .._results import RESULTS
 from .._system import AbstractSystem, HamiltonianSystem, State
 from .._types import Args, Coordinates, Flag, Multipliers, Scalar, Velocities
 from .events import Impact
@@ -73,12 +74,20 @@ def resting_of(model: AbstractModel) -> Resting:
 
 class Hits(eqx.Module):
     """What impacts do: the state after them, the gaps that stay closed and their forces,
-    and whether all other gaps open."""
+    and a failure."""
 
     state: State
     resting: Resting | None
     forces: Float[Array, " gaps"]
-    resolved: Flag
+    result: RESULTS
+
+
+class Rest(eqx.Module):
+    """When gaps stay closed: `time` to the next hit and `heights` of the hops until then
+    below which they do."""
+
+    time: Scalar
+    heights: Float[Array, " gaps"]
 
 
 class Impacts(eqx.Module):
@@ -147,27 +156,32 @@ class Impacts(eqx.Module):
         last = first + len(self.impacts)
         return jnp.concatenate([rows[..., :first], rows[..., last:]], axis=-1)
 
-    def after(self, model: AbstractModel, state: State, happens: Array, h: Scalar) -> Hits:
-        """The state after the impacts that happen; `h` is the usual length of a step.
-
-        A gap of which the next hit would follow within less than `h` stays closed. States
-        are those of `model`, which is `in_rates`.
-        """
+    def after(self, model: AbstractModel, state: State, happens: Array, rest: Rest) -> Hits:
+        """The state after the impacts that happen; states are those of `model`, which is
+        `in_rates`."""
         resting = resting_of(model) if self.can_rest else None
         if resting is not None:
             released = happens & (resting > 0)
             resting, happens = jnp.where(released, 0.0, resting), happens & ~released
-        state, resting, resolved = self._hit(model, state, happens, resting)
+        e = self.restitutions(model.args, state.q.dtype)
+        valid = jnp.all((e >= 0) & (e <= 1))
+        state, resting, closes = self._hit(model, state, happens, resting)
         if resting is None:
-            return Hits(state, None, jnp.zeros_like(happens, h.dtype), resolved)
-        inelastic = self.restitutions(model.args, h.dtype) < 1
+            forces = jnp.zeros_like(happens, state.q.dtype)
+            return Hits(state, None, forces, _outcome(valid, ~jnp.any(closes)))
         before = resting
+        # Where hits in turn do not end, these gaps close for good.
+        resting = jnp.maximum(resting, closes.astype(resting.dtype))
         resting, forces, ended = self.consistent(
-            model, state, resting, happens & inelastic, h
+            model, state, resting, happens & (e < 1), rest
         )
         held = project_velocity(with_resting(model, resting), state, ())[0]
         v = jnp.where(jnp.any(resting > before), held, state.v)
-        return Hits(State(state.q, v, state.t), resting, forces, resolved & ended)
+        end = State(state.q, v, state.t)
+        scale = jnp.max(jnp.abs(self.rates(model, state)))
+        still = self.rates(model, end) < -(jnp.finfo(v.dtype).eps ** 0.5) * scale
+        resolved = ended & ~jnp.any(happens & still)
+        return Hits(end, resting, forces, _outcome(valid, resolved))
 
     def _hit(
         self,
@@ -175,36 +189,27 @@ class Impacts(eqx.Module):
         state: State,
         happens: Bool[Array, " gaps"],
         resting: Resting | None,
-    ) -> tuple[State, Resting | None, Flag]:
-        """The state after the impacts, one after another until all of these gaps open."""
-        q = state.q
-        e = self.restitutions(model.args, q.dtype)
-        rates = lambda v: self.rates(model, State(q, v, state.t))
+    ) -> tuple[State, Resting | None, Bool[Array, " gaps"]]:
+        """The state after the impacts, one after another until none of these gaps closes,
+        and the gaps that still do.
+
+        Derivatives are those of impacts one after another too: each happens at the zero of
+        its own gap, at a time that differs by `shift`, which is zero but has derivatives.
+        """
+        e = self.restitutions(model.args, state.q.dtype)
         corrections = 8 if isinstance(model.system, HamiltonianSystem) else 1
-        weight = model.inverse_regular_metric(state)
+        constant = jax.lax.stop_gradient
 
         def hit(carry: tuple, k: Array) -> tuple[tuple, None]:
-            v, resting = carry
-            slope = jax.grad(lambda v: rates(v)[k])(v)
-
-            def by_unit_impulse(held: Resting | None) -> Velocities:
-                inner = model if held is None else with_resting(model, held)
-                pushed = State(q, v + weight @ slope, state.t)
-                return project_velocity(inner, pushed, ())[0] - v
-
-            if resting is None:
-                pressed, change = None, by_unit_impulse(None)
-            else:
-                # A closed gap transmits the impact if this presses it, and opens if not.
-                def press(held: Resting, _: None) -> tuple[Resting, tuple]:
-                    change = by_unit_impulse(held)
-                    moved = jax.jvp(rates, (v,), (change,))[1]
-                    return jnp.where(moved < 0, resting, 0.0), (held, change)
-
-                none = jnp.zeros_like(resting)
-                _, tried = jax.lax.scan(press, none, None, length=2)
-                pressed, change = jax.tree.map(lambda x: x[-1], tried)
-            rate = rates(v)[k]
+            q, v, resting = carry
+            at = State(q, v, state.t)
+            gap, rate = self.gaps(q, model.args)[k], self.rates(model, at)[k]
+            is_hit = happens[k] & (rate < 0)
+            shift = (constant(gap) - gap) / constant(jnp.where(is_hit, rate, 1.0))
+            q, v = self._moved(model, at, resting, shift)
+            rates = lambda v: self.rates(model, State(q, v, state.t))
+            rate, slope = rates(v)[k], jax.grad(lambda v: rates(v)[k])(v)
+            pressed, change = self._push(model, State(q, v, state.t), slope, resting)
 
             def correct(impulse: Scalar, _: None) -> tuple[Scalar, None]:
                 off = -e[k] * rate - rates(v + impulse * change)[k]
@@ -212,19 +217,54 @@ class Impacts(eqx.Module):
 
             none = jnp.zeros_like(rate)
             impulse, _ = jax.lax.scan(correct, none, None, length=corrections)
-            is_hit = happens[k] & (rate < 0)
-            after = v + impulse * change, pressed
-            return jax.tree.map(lambda x, y: jnp.where(is_hit, x, y), after, carry), None
+            after = State(q, v + impulse * change, state.t)
+            q, v = self._moved(model, after, pressed, -shift)
+            choose = lambda x, y: jnp.where(is_hit, x, y)
+            return jax.tree.map(choose, (q, v, pressed), carry), None
 
         number = len(self.impacts)
         order = jnp.tile(jnp.arange(number), 1 if number == 1 else _SWEEPS)
-        (v, resting), _ = jax.lax.scan(hit, (state.v, resting), order)
-        eps = jnp.finfo(q.dtype).eps
-        # Hits without rebound in turn halve the rates, which are then set to zero.
-        least = 1e3 * eps if resting is None else eps**0.5
-        closing = rates(v) < -least * jnp.max(jnp.abs(rates(state.v)))
-        resolved = ~jnp.any(happens & closing)
-        return State(q, v, state.t), resting, resolved
+        (q, v, resting), _ = jax.lax.scan(hit, (state.q, state.v, resting), order)
+        end = State(q, v, state.t)
+        eps, speed = jnp.finfo(q.dtype).eps, jnp.max(jnp.abs(self.rates(model, state)))
+        closes = happens & (self.rates(model, end) < -1e3 * eps * speed)
+        return end, resting, closes
+
+    def _moved(
+        self, model: AbstractModel, state: State, held: Resting | None, shift: Scalar
+    ) -> tuple[Coordinates, Velocities]:
+        """Positions and velocities after the time `shift`, to first order."""
+        if len(self.impacts) == 1:
+            return state.q, state.v
+        inner = model if held is None else with_resting(model, held)
+        rates = inner.lift(state.q, state.v), inner.accelerations(state)[0]
+        qdot, vdot = jax.lax.stop_gradient(rates)
+        return state.q + shift * qdot, state.v + shift * vdot
+
+    def _push(
+        self, model: AbstractModel, state: State, slope: Velocities, resting: Resting | None
+    ) -> tuple[Resting | None, Velocities]:
+        """The gaps that stay closed in a hit, and the change of the velocities by a unit
+        impulse along `slope`."""
+        pushed = state.v + model.inverse_regular_metric(state) @ slope
+
+        def change_with(held: Resting | None) -> Velocities:
+            inner = model if held is None else with_resting(model, held)
+            after = project_velocity(inner, State(state.q, pushed, state.t), ())[0]
+            return after - state.v
+
+        if resting is None:
+            return None, change_with(None)
+        rates = lambda v: self.rates(model, State(state.q, v, state.t))
+
+        # A closed gap transmits the impact if this presses it, and opens if not.
+        def press(held: Resting, _: None) -> tuple[Resting, tuple]:
+            change = change_with(held)
+            moves = jax.jvp(rates, (state.v,), (change,))[1]
+            return jnp.where(moves < 0, resting, 0.0), (held, change)
+
+        _, tried = jax.lax.scan(press, jnp.zeros_like(resting), None, length=2)
+        return jax.tree.map(lambda x: x[-1], tried)
 
     def consistent(
         self,
@@ -232,26 +272,35 @@ class Impacts(eqx.Module):
         state: State,
         resting: Resting,
         touching: Bool[Array, " gaps"],
-        h: Scalar,
+        rest: Rest,
     ) -> tuple[Resting, Float[Array, " gaps"], Flag]:
         """The gaps that stay closed, their forces, and whether the search for them has
         ended.
 
         No force pulls, and every gap stays closed that is `touching` and would close again
-        within the time `h`. Gaps open before others close.
+        soon, as `rest` says. Gaps open before others close.
         """
-        rounding = jnp.finfo(h.dtype).eps ** 0.5
+        rounding = jnp.finfo(state.q.dtype).eps ** 0.5
         rate = self.rates(model, state)
 
         def improve(resting: Resting, _: None) -> tuple[Resting, tuple[Array, Flag]]:
             acceleration, force = self.motion(with_resting(model, resting), state)
             pulls = force < -rounding * jnp.max(jnp.abs(force))
-            # The next hit is due after the time `2 rate / -acceleration`.
-            closes = touching & (acceleration < 0) & (2 * rate < -h * acceleration)
+            # The next hit is due after the time `2 rate / -acceleration`, and the gap then
+            # has been `rate^2 / (2 -acceleration)` wide.
+            soon = 2 * rate < -rest.time * acceleration
+            low = rate * jnp.abs(rate) <= -2 * acceleration * rest.heights
+            closes = touching & (acceleration < 0) & soon & low
             closes = jnp.where(closes & ~jnp.any(pulls), 1.0, resting)
-            new = jnp.where(pulls, 0.0, closes).astype(h.dtype)
+            new = jnp.where(pulls, 0.0, closes).astype(state.q.dtype)
             return new, (force, jnp.all(new == resting))
 
         length = 2 * len(self.impacts) + 1
         resting, (forces, ended) = jax.lax.scan(improve, resting, None, length=length)
         return jax.lax.stop_gradient(resting), forces[-1], ended[-1]
+
+
+def _outcome(valid: Flag, resolved: Flag) -> RESULTS:
+    """The outcome of impacts: whether restitutions are valid, and no gap closes."""
+    result = RESULTS.where(resolved, RESULTS.successful, RESULTS.impacts_unresolved)
+    return RESULTS.where(valid, result, RESULTS.restitution_out_of_range)

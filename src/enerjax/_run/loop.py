@@ -6,9 +6,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from .._operators import AbstractModel
+from .._programs import in_any_lane
 from .._results import first_failure, RESULTS
 from .._solvers import RootFinder
 from .._system import State
@@ -199,19 +200,16 @@ def attempt_with_events(
     verdict = _judged(stepper, watcher, before, out, length, found)
     happens = found.happens & live & verdict.accepted
     t = plan.time(place)
-    changed = watcher.after(
-        model,
-        out.state,
-        t,
-        happens,
-        plan.unit * plan.usual(before.memory),
-        lambda user, args: model_for(stepper.scheme, model.system, user, args),
-    )
+    rest = watcher.rest(watch, plan.unit * plan.usual(before.memory), plan.least_hop)
+    remade = lambda user, args: model_for(stepper.scheme, model.system, user, args)
+    changed = watcher.after(model, out.state, t, happens, rest, remade)
     later = eqx.combine(changed.varying, model)
-    unresolved = verdict.accepted & ~changed.resolved
-    failure = RESULTS.where(unresolved, RESULTS.impacts_unresolved, RESULTS.successful)
+    failure = RESULTS.where(verdict.accepted, changed.result, RESULTS.successful)
+    failure = first_failure(
+        failure, _check_resets(stepper, watcher, later, changed.state, place, happens)
+    )
     verdict = Verdict(
-        accepted=verdict.accepted & changed.resolved,
+        accepted=verdict.accepted & (failure == RESULTS.successful),
         result=first_failure(verdict.result, failure),
         memory=_after_event(stepper, later, before, verdict, changed.state, place, happens),
     )
@@ -243,6 +241,30 @@ def attempt_with_events(
     return after, eqx.tree_at(
         lambda x: x.happening, attempt, happening, is_leaf=lambda x: x is None
     )
+
+
+def _check_resets(
+    stepper: Stepper,
+    watcher: Watcher,
+    model: AbstractModel,
+    state: State,
+    place: Scalar,
+    happens: Array,
+) -> RESULTS:
+    """Whether the state after resets satisfies the constraints, as a start must."""
+    if not watcher.resets.any():
+        return RESULTS.successful
+    plan = stepper.plan
+    timed = with_time(model, plan, state, place)
+
+    def is_bad() -> Flag:
+        found = _check_start(stepper.scheme, model, timed, plan.unit * plan.first())
+        return found != RESULTS.successful
+
+    was_reset = jnp.any(happens & watcher.resets)
+    bad = jax.lax.cond(in_any_lane(was_reset), is_bad, lambda: jnp.array(False))
+    bad = bad & was_reset
+    return RESULTS.where(bad, RESULTS.inconsistent_reset, RESULTS.successful)
 
 
 def _judged(

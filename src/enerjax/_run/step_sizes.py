@@ -70,6 +70,11 @@ class AbstractPlan(eqx.Module):
     def usual(self, memory: PyTree[Any]) -> Scalar:
         """The length of a step that no event and no end of the run makes shorter."""
 
+    @property
+    @abc.abstractmethod
+    def least_hop(self) -> Scalar:
+        """The part of the largest gap below which hops between impacts are neglected."""
+
     @abc.abstractmethod
     def after_event(
         self,
@@ -199,6 +204,8 @@ class EqualSteps(AbstractController):
 
 # The fraction of an equal step that is too short for a step of its own.
 NEAR = 1e-12
+# The part of the largest gap below which a hop in a run of equal steps is neglected.
+_LEAST_HOP = 1e-3
 
 
 class _EqualPlan(AbstractPlan):
@@ -225,6 +232,10 @@ class _EqualPlan(AbstractPlan):
 
     def usual(self, memory: None) -> Scalar:
         return self.first()
+
+    @property
+    def least_hop(self) -> Scalar:
+        return jnp.asarray(_LEAST_HOP, self.unit.dtype)
 
     def after_event(
         self, old: None, new: None, model: AbstractModel, state: State, happened: Flag

@@ -26,7 +26,7 @@ from .event_search import (
     ZERO,
 )
 from .events import AbstractEvent, checked_events, Event, Impact
-from .impacts import Impacts, is_resting_number, resting_of, with_resting
+from .impacts import Impacts, is_resting_number, Rest, resting_of, with_resting
 
 
 class Happening(eqx.Module):
@@ -41,13 +41,13 @@ class Happening(eqx.Module):
 
 class Changed(eqx.Module):
     """What events have made of a state and a model, the forces of closed gaps, the energy
-    that was removed, and whether all gaps open after impacts."""
+    that was removed, and a failure."""
 
     state: State
     varying: PyTree[Any]
     forces: Float[Array, " events"]
     lost: Scalar
-    resolved: Flag
+    result: RESULTS
 
 
 class Watcher(eqx.Module):
@@ -99,6 +99,15 @@ class Watcher(eqx.Module):
     def system(self, system: AbstractSystem, dtype: Any) -> AbstractSystem:
         """The system of the run, with a constraint for each gap that may stay closed."""
         return self.impacts.constrained(system, dtype) if self.can_rest else system
+
+    @property
+    def resets(self) -> np.ndarray:
+        """Which events have resets."""
+        return self.changes_state & ~self._is_impact
+
+    def rest(self, watch: Watch, time: Scalar, least_hop: Scalar) -> Rest:
+        """When gaps stay closed; `least_hop` is a part of the largest gaps so far."""
+        return Rest(time, least_hop * watch.largest[np.flatnonzero(self._is_impact)])
 
     def varying(self, model: AbstractModel) -> PyTree[Any]:
         """The part of a model that events change."""
@@ -171,6 +180,7 @@ class Watcher(eqx.Module):
             side=_sign(jnp.where(at_zero, slope, values)),
             values=values,
             sizes=none,
+            largest=jnp.where(closed, 0.0, jnp.abs(values)),
             is_force=closed,
             starts=at_zero & (slope != 0),
             search=no_search(values.dtype),
@@ -179,7 +189,8 @@ class Watcher(eqx.Module):
         )
         watch = eqx.tree_at(lambda w: w.sizes, watch, watch.sizes_with(values, closed))
         # Forces push, and gaps are open or open now.
-        opens = opens & ~jnp.any(jnp.asarray(self._is_impact) & (watch.side < 0))
+        shut = (watch.side < 0) | (at_zero & (slope <= 0))
+        opens = opens & ~jnp.any(jnp.asarray(self._is_impact) & ~closed & shut)
         result = RESULTS.where(opens, RESULTS.successful, RESULTS.gap_closed_at_start)
         return watch, self.varying(model) if self.changes_model else None, result
 
@@ -211,8 +222,9 @@ class Watcher(eqx.Module):
         touching = jnp.abs(value) <= rounding * jnp.maximum(jnp.abs(size), 1e-3)
         still = jnp.abs(rate) <= rounding * jnp.abs(speed)
         none, instant = jnp.zeros_like(value), jnp.asarray(rounding, value.dtype)
+        rest = Rest(instant, none)
         resting, forces, ended = impacts.consistent(
-            model.in_rates, start, none, touching & still, instant
+            model.in_rates, start, none, touching & still, rest
         )
         return with_resting(model, resting), self._of_events(forces), ended
 
@@ -294,11 +306,15 @@ class Watcher(eqx.Module):
         """What happens in a step of this length."""
         directions = [event.direction for event in self.events]
         direction = jnp.asarray(directions, watch.side.dtype)
-        # Only from one side a zero is an event.
+        # Only from one side a zero is an event, and only after a function was not zero.
         armed = (direction == 0) | (watch.side == -direction)
+        is_flat = jnp.abs(watch.values) <= round_off(watch.sizes, watch.is_force)
+        armed = armed & (watch.starts | ~is_flat)
         found = find(watch, armed, values, length, extremum)
         closes = jnp.any(jnp.asarray(self._is_impact) & (watch.side < 0))
         result = RESULTS.where(closes, RESULTS.impacts_unresolved, found.result)
+        finite = jnp.all(jnp.isfinite(values))
+        result = RESULTS.where(finite, result, RESULTS.nonfinite)
         return eqx.tree_at(lambda found: found.result, found, result)
 
     def after(
@@ -307,24 +323,24 @@ class Watcher(eqx.Module):
         state: State,
         t: Scalar,
         happens: Array,
-        h: Scalar,
+        rest: Rest,
         remade: Callable[[State, Args], AbstractModel],
     ) -> Changed:
         """What all events that happen have made of a state and a model.
 
         Resets come first, in their order, then impacts. `remade(state, args)` is the model
-        with other `args`, and `h` the usual length of a step.
+        with other `args`, and `rest` tells which gaps stay closed.
         """
         varying = self.varying(model) if self.changes_model else None
-        zero, yes = jnp.zeros((), state.q.dtype), jnp.array(True)
+        zero, good = jnp.zeros((), state.q.dtype), RESULTS.successful
         no_forces = jnp.zeros((len(self.events),), state.q.dtype)
         if not self.changes_state.any():
-            return Changed(state, varying, no_forces, zero, yes)
+            return Changed(state, varying, no_forces, zero, good)
 
         def change(state: State) -> Changed:
             before = inner_state(model, state, t)
             changed, after = self._reset(model, before, t, happens, remade)
-            after, changed, forces, resolved = self._hit(changed, after, happens, h)
+            after, changed, forces, result = self._hit(changed, after, happens, rest)
             energy = lambda model, x: (
                 model.in_rates.kinetic(x) + model.in_rates.potential(x)
             )
@@ -339,10 +355,10 @@ class Watcher(eqx.Module):
                 jax.tree.map(keep, varying, new_varying),
                 forces,
                 keep(zero, lost),
-                same | resolved,
+                RESULTS.where(same, good, result),
             )
 
-        none = lambda state: Changed(state, varying, no_forces, zero, yes)
+        none = lambda state: Changed(state, varying, no_forces, zero, good)
         changed = jnp.any(happens & jnp.asarray(self.changes_state))
         return jax.lax.cond(in_any_lane(changed), change, none, state)
 
@@ -370,17 +386,17 @@ class Watcher(eqx.Module):
         return model, after
 
     def _hit(
-        self, model: AbstractModel, state: State, happens: Array, h: Scalar
-    ) -> tuple[State, AbstractModel, Float[Array, " events"], Flag]:
+        self, model: AbstractModel, state: State, happens: Array, rest: Rest
+    ) -> tuple[State, AbstractModel, Float[Array, " events"], RESULTS]:
         """The state, in rates, and the model after all impacts, and the forces of gaps."""
         if not self._is_impact.any():
             none = jnp.zeros((len(self.events),), state.q.dtype)
-            return state, model, none, jnp.array(True)
+            return state, model, none, RESULTS.successful
         numbers = np.flatnonzero(self._is_impact)
-        hits = self.impacts.after(model.in_rates, state, happens[numbers], h)
+        hits = self.impacts.after(model.in_rates, state, happens[numbers], rest)
         if hits.resting is not None:
             model = with_resting(model, hits.resting)
-        return hits.state, model, self._of_events(hits.forces), hits.resolved
+        return hits.state, model, self._of_events(hits.forces), hits.result
 
     def watch_after(
         self,
@@ -408,7 +424,8 @@ class Watcher(eqx.Module):
             values = jnp.where(happened, new, values)
         values = jax.lax.stop_gradient(values)
         closed = self.closed(model)
-        sizes = watch.sizes_with(values, closed)
+        older = eqx.tree_at(lambda watch: watch.sizes, watch, 0.5 * watch.sizes)
+        sizes = older.sizes_with(values, closed)
         is_zero = ~closed & (happens | (jnp.abs(values) <= round_off(sizes, closed)))
         # From a zero a function moves to the side of its slope.
         of_motion = lambda: jax.lax.stop_gradient(self._slopes(model, state, t))
@@ -426,6 +443,9 @@ class Watcher(eqx.Module):
             side=side,
             values=values,
             sizes=sizes,
+            largest=jnp.where(
+                closed, watch.largest, jnp.fmax(watch.largest, jnp.abs(values))
+            ),
             is_force=closed,
             starts=starts,
             search=no_search(values.dtype),

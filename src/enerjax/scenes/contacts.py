@@ -21,8 +21,8 @@ class Restitution(eqx.Module):
     """An exact impact: the rate of the gap is multiplied by `-coefficient`; see `Impact`.
 
     `coefficient` is a number from 0 to 1, and a number of the part, `args.set("floor",
-    restitution=0.7)`. Without one the impact is elastic for good: no energy is lost, and no
-    gap stays closed, which makes the program smaller.
+    restitution=0.7)`. Without one the impact is elastic: no energy is lost, no gap stays
+    closed, and the program is smaller.
     """
 
     coefficient: Real | None = None
@@ -34,7 +34,7 @@ class Penalty(eqx.Module):
     It is `stiffness d^exponent (1 + damping ddot)`: Hertz's law for spheres with the
     exponent 3/2, and Hunt and Crossley's damper. The spring has a potential, so with
     `damping` zero energy is conserved like that of other springs. `stiffness` is a force
-    per length^exponent, `exponent` at least one, `damping` one over a velocity.
+    per length^exponent, `exponent` at least one, and `damping` a time per length.
 
     **Reference:** K. H. Hunt and F. R. E. Crossley, Coefficient of restitution interpreted
     as damping in vibroimpact, J. Appl. Mech. 42 (1975) 440-445.
