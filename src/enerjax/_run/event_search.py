@@ -24,6 +24,8 @@ from .._types import Count, Flag, Scalar
 ZERO = 64.0
 # The same for the force of a closed gap, which has the error of a linear solve.
 _ZERO_FORCE = 1e4
+# The part of its largest value below which a function is not expected to be exact.
+_FAINTEST = 1e-3
 # The attempts of one search. Ten usually suffice; steps that are halved forty times, for a
 # function that touches zero at their start, need more.
 MAX_TRIES = 80
@@ -36,7 +38,8 @@ class Watch(eqx.Module):
     - `side`: the sign that each function has before its next zero.
     - `values`: of all functions.
     - `sizes`: the largest absolute values of late, in the first row of the functions of the
-      user and in the second of the forces of closed gaps. Each step halves older ones.
+      user and in the second of the forces of closed gaps. Each step halves those of
+      functions, down to a thousandth of the largest.
     - `largest`: the largest absolute values of the functions of the user so far.
     - `is_force`: for which events the function is the force of a closed gap.
     - `starts`: which functions are zero and move to their side.
@@ -54,6 +57,12 @@ class Watch(eqx.Module):
     search: "Search"
     count: Count
     ended: Flag
+
+    def faded(self) -> "Watch":
+        """With smaller sizes of functions, so that those that decay have zeros too."""
+        functions = jnp.maximum(0.5 * self.sizes[0], _FAINTEST * self.largest)
+        sizes = jnp.stack([functions, self.sizes[1]])
+        return eqx.tree_at(lambda watch: watch.sizes, self, sizes)
 
     def sizes_with(self, values: Array, is_force: Array) -> Float[Array, "2 events"]:
         """The sizes of late with those of these values."""

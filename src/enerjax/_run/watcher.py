@@ -424,8 +424,7 @@ class Watcher(eqx.Module):
             values = jnp.where(happened, new, values)
         values = jax.lax.stop_gradient(values)
         closed = self.closed(model)
-        older = eqx.tree_at(lambda watch: watch.sizes, watch, 0.5 * watch.sizes)
-        sizes = older.sizes_with(values, closed)
+        sizes = watch.faded().sizes_with(values, closed)
         is_zero = ~closed & (happens | (jnp.abs(values) <= round_off(sizes, closed)))
         # From a zero a function moves to the side of its slope.
         of_motion = lambda: jax.lax.stop_gradient(self._slopes(model, state, t))
