@@ -94,7 +94,7 @@ BAD = {
         lambda: [ROD, ej.forces.Damper("damper", "ground", "rod", -1.0)],
         "`damping` of 'damper' must not be below 0",
     ),
-    "stranger": (lambda: [ROD, "pin"], "made of bodies, joints, forces and drives"),
+    "stranger": (lambda: [ROD, "pin"], "made of bodies, joints, forces, drives and"),
     "no list": (lambda: ROD, "a list of parts.*\\[rod\\]"),
     "ground": (lambda: [Point("ground", 1.0, [0.0, 0.0])], "'ground' is reserved"),
     "no name": (

@@ -233,6 +233,7 @@ def test_newmark_is_the_trapezoidal_rule():
     assert change(ej.GeneralizedAlpha.hht(-0.3)) > 1e-2
 
 
+@pytest.mark.slow
 def test_derivatives_pass_through_the_carried_acceleration():
     system, start, args = problem("pendulum")
 

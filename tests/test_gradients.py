@@ -252,6 +252,7 @@ def test_derivatives_of_a_free_oscillator():
     np.testing.assert_allclose(jax.jit(jax.grad(end))(1.0), exact, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_where_the_stiffness_has_eigenvalues_of_both_signs():
     """The dissipative stiffness is the positive part of one, in the metric of the inertia;
     differences."""

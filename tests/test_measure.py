@@ -47,6 +47,7 @@ def test_orders_of_the_pendulum():
     np.testing.assert_allclose(table.order_multipliers, 1, atol=0.1)
 
 
+@pytest.mark.slow
 def test_the_extrapolated_reference_is_as_good_as_exact_data():
     table, given = orders(), against_data()
     assert max(table.uncertainty["q"], table.uncertainty["v"]) <= 1e-10

@@ -72,7 +72,7 @@ def sleigh():
     ("scheme", "order", "bound"),
     [
         (PRESERVING, 2, 1e-3),
-        (ej.Composed(PRESERVING, 4), 4, 1e-7),
+        pytest.param(ej.Composed(PRESERVING, 4), 4, 1e-7, marks=pytest.mark.slow),
         (ej.EnergyDecaying(0.0), 2, 1e-3),
         pytest.param(ej.Rattle(), 2, 1e-3, marks=pytest.mark.slow),
     ],
@@ -106,6 +106,7 @@ def test_the_multiplier_is_the_force_on_the_edge(sleigh):
     np.testing.assert_allclose(-sleigh.multipliers[1:, 0], force, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_volume_is_not_preserved():
     def end(x):
         return jnp.stack(edge_velocities(jax.tree.map(lambda y: y[-1], run(x).ys)))
@@ -130,6 +131,7 @@ def test_energy_decays_by_the_amount_that_the_scheme_reports():
     assert np.abs(sol.audit.constraint_rate).max() < 2e-15
 
 
+@pytest.mark.slow
 def test_a_knife_edge_of_a_scene_is_the_sleigh(sleigh, tmp_path):
     start = sleigh_at(U0, W0)
     body = ej.bodies.PlanarBody(

@@ -186,6 +186,7 @@ def test_derivatives_of_multipliers_of_least_norm(scheme):
     np.testing.assert_allclose(forward, change, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_derivatives_of_forces_that_turn_against_each_other():
     """A point at rest on three rods: where these end decides how they share its weight."""
     feet = lambda x: jnp.array([[-1.0, 1.0], [1.0, 1.2], [0.2, 1.0]]).at[2, 0].add(x)

@@ -660,6 +660,7 @@ def test_batches_of_masses_and_steps_are_runs_one_by_one():
     near(batch, alone, 100)  # solver
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "controller",
     [
@@ -713,6 +714,7 @@ def balanced(scene, scheme="preserving", steps=200):
     return run
 
 
+@pytest.mark.slow
 def test_a_damped_body_on_a_moving_pivot_balances_its_energy():
     place = lambda t, args: jnp.stack([0.2 * jnp.sin(3 * t), 0.0 * t, 0.1 * t**2])
     parts = [

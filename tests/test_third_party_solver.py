@@ -60,6 +60,7 @@ def expected():
     return [pushed(g, None) for g in GS]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", long(SOLVERS, "scipy"))
 def test_the_motion_and_its_derivatives_are_those_of_the_default(name, expected):
     """Forward in the lanes of a batch, in reverse alone."""
