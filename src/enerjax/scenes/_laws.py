@@ -184,7 +184,17 @@ class AbstractPotentialLaw(AbstractLaw):
         """The energy, a scalar."""
 
 
-class AbstractSpringLaw(AbstractLaw):
+class AbstractLawOfMeasure(AbstractLaw):
+    """A law of a length, an angle or a vector; it reads what this measure reads."""
+
+    measure: AbstractMeasure
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return self.measure.reads
+
+
+class AbstractSpringLaw(AbstractLawOfMeasure):
     """A potential energy of a measure; the force along the measure is minus its slope.
 
     - `damper`: a force along the same measure that acts as well, if any.
@@ -192,10 +202,6 @@ class AbstractSpringLaw(AbstractLaw):
 
     measure: AbstractMeasure
     damper: "AbstractForceLaw | None" = None
-
-    @property
-    def reads(self) -> tuple[str, ...]:
-        return self.measure.reads
 
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Scalar:
         return self.energy(self.measure(a, b, numbers), numbers)
@@ -234,56 +240,40 @@ Signal = TypeAliasType("Signal", Callable[[Scalar, Args], Array])
 
 
 @dataclass(frozen=True)
-class Driven(AbstractLaw):
+class Driven(AbstractLawOfMeasure):
     """Keeps a measure at the value of a signal, which is in `numbers["value"]`."""
 
     measure: AbstractMeasure
     signal: Signal
 
-    @property
-    def reads(self) -> tuple[str, ...]:
-        return self.measure.reads
-
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Multipliers:
         return self.measure.constraint(a, b, numbers, numbers["value"])
 
 
 @dataclass(frozen=True)
-class Flywheel(AbstractLaw):
+class Flywheel(AbstractLawOfMeasure):
     """Keeps a measure at the coordinate of an inerter, which is in `numbers["value"]`."""
 
     measure: AbstractMeasure
 
-    @property
-    def reads(self) -> tuple[str, ...]:
-        return self.measure.reads
-
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Multipliers:
         return self.measure.constraint(a, b, numbers, numbers["value"])
 
 
 @dataclass(frozen=True)
-class Deviation(AbstractLaw):
+class Deviation(AbstractLawOfMeasure):
     """The difference of a measure from `numbers["value"]`, at which it is to be kept."""
 
     measure: AbstractMeasure
-
-    @property
-    def reads(self) -> tuple[str, ...]:
-        return self.measure.reads
 
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Multipliers:
         return self.measure.deviation(a, b, numbers, numbers["value"])
 
 
-class AbstractForceLaw(AbstractLaw):
+class AbstractForceLaw(AbstractLawOfMeasure):
     """A force along a measure that has no potential; its power is `force * rate`."""
 
     measure: AbstractMeasure
-
-    @property
-    def reads(self) -> tuple[str, ...]:
-        return self.measure.reads
 
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Any:
         return self.measure(a, b, numbers)
@@ -302,15 +292,11 @@ class Viscous(AbstractForceLaw):
 
 
 @dataclass(frozen=True)
-class Gap(AbstractLaw):
+class Gap(AbstractLawOfMeasure):
     """A gap that must not become negative, with an impact where it closes."""
 
     measure: AbstractMeasure
     is_elastic: bool
-
-    @property
-    def reads(self) -> tuple[str, ...]:
-        return self.measure.reads
 
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Scalar:
         return self.measure(a, b, numbers)

@@ -178,7 +178,7 @@ class Room(AbstractMeasure):
     measure: AbstractMeasure
     lower: bool
 
-    # An angle counts as a length here: it needs no full turns, and is drawn as a contact.
+    # The room left to an angle is not an angle itself: it has no full turns to count.
     @property
     def reads(self) -> tuple[str, ...]:
         return self.measure.reads
