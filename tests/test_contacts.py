@@ -54,6 +54,7 @@ def test_a_bar_hits_a_stop_and_comes_to_rest():
     assert sol.multipliers.shape[1] == 2  # of the pin alone
 
 
+@pytest.mark.slow
 def test_elastic_hits_of_a_sphere_in_a_bowl_keep_the_energy():
     parts = [
         ej.bodies.RigidBody("ball", 1.0, [0.1, 0.1, 0.1], [0.3, 0.0, 0.2]),

@@ -72,6 +72,7 @@ def test_a_rotor_shares_a_torque_among_two_bodies(in_space):
         assert slope == pytest.approx(torque * j2 * (j1 + j2) / d**2, rel=1e-11)
 
 
+@pytest.mark.slow
 def test_an_inerter_keeps_the_energy_over_full_turns():
     """A wheel that turns several times: the coordinate of the rotor counts the turns, as
     the angle along a run does. The energy is exact to Newton's method."""

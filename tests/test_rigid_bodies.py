@@ -464,6 +464,7 @@ def hung_run(scheme, h):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_hung_body_swings_as_one_whose_directors_are_coordinates():
     def end(scheme, steps):
         run = hung_run(scheme, 1 / steps)
@@ -600,6 +601,7 @@ def begin(system):
     return ej.initial_state(system, OWN_START, np.zeros(12), OWN_ARGS)
 
 
+@pytest.mark.slow
 def test_a_system_of_the_user_moves_as_the_scene():
     first, system = turning(SPEED), own()
     places = np.argsort(PLACES)

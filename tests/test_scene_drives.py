@@ -101,6 +101,7 @@ def test_the_motor_of_a_slider_crank_gives_what_its_energy_and_the_damper_take()
     np.testing.assert_array_equal(multipliers[1:, 0], -torque)
 
 
+@pytest.mark.slow
 def test_the_motor_of_a_crank_gives_what_gravity_and_a_brake_take():
     parts = [
         Rod("crank", 1.0, [0.0, 0.0], [2 * R, 0.0]),

@@ -41,6 +41,7 @@ def orders():
     )
 
 
+@pytest.mark.slow
 def test_its_order_is_two_with_constraints(orders):
     for slopes in (orders.order_q[0], orders.order_v[0]):
         assert np.all(np.abs(slopes - 2) < 0.1)  # truncation
