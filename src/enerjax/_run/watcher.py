@@ -158,9 +158,11 @@ class Watcher(eqx.Module):
         self, model: AbstractModel, state: State, t: Scalar
     ) -> Float[Array, " events"]:
         """The functions of all events, also where gaps are closed."""
-        user = model.to_user(state)
-        values = [event.value(user, t, model.args) for event in self.events]
-        return jnp.stack(values).astype(state.q.dtype)
+        return self._evaluated(model.to_user(state), t, model.args)
+
+    def _evaluated(self, user: State, t: Scalar, args: Args) -> Float[Array, " events"]:
+        values = [event.value(user, t, args) for event in self.events]
+        return jnp.stack(values).astype(user.q.dtype)
 
     def begin(
         self, model: AbstractModel, state: State, t: Scalar, h: Scalar
@@ -242,9 +244,7 @@ class Watcher(eqx.Module):
 
         def values(q, v, t):
             timed = None if state.t is None else t
-            user = inner.to_user(State(q, v, timed))
-            values = [event.value(user, t, model.args) for event in self.events]
-            return jnp.stack(values).astype(q.dtype)
+            return self._evaluated(inner.to_user(State(q, v, timed)), t, model.args)
 
         at, along = (in_rates.q, in_rates.v, t), (qdot, vdot, jnp.ones_like(t))
         return jax.jvp(values, at, along)[1]
@@ -265,8 +265,7 @@ class Watcher(eqx.Module):
         at the vertex of the parabola through three values.
         """
         between = _motion_between(model, ends, times)
-        middle = self._values_at(model, between, 0.5)
-        side = jnp.where(watch.values < 0, -1.0, 1.0).astype(values.dtype)
+        middle, side = self._evaluated(*between(0.5), model.args), _sign(watch.values)
         first, half, last = side * watch.values, side * middle, side * values
         bend, slope = 2 * (first - 2 * half + last), 4 * half - 3 * first - last
         vertex = -slope / (2 * jnp.where(bend > 0, bend, 1.0))
@@ -289,16 +288,6 @@ class Watcher(eqx.Module):
         passes = same_sign & (least < -zero)
         part = jnp.min(jnp.where(passes, vertex, 1.0))
         return part, jnp.any(passes)
-
-    def _values_at(
-        self,
-        model: AbstractModel,
-        motion: Callable[[Any], tuple[State, Scalar]],
-        part: float,
-    ) -> Float[Array, " events"]:
-        state, t = motion(part)
-        values = [event.value(state, t, model.args) for event in self.events]
-        return jnp.stack(values).astype(state.q.dtype)
 
     def found(
         self, watch: Watch, values: Array, length: Scalar, extremum: tuple[Scalar, Flag]
