@@ -477,12 +477,12 @@ def _states_within(
         b = jax.tree.map(lambda x, y: jnp.where(part > 0, x, y), pick(ends), a)
         begin, end = with_time(model, plan, a, first), with_time(model, plan, b, last)
         h = plan.unit * (last - first)
-        state = state_within(model, begin, end, h, part, run.order)
-        after = jax.tree.map(lambda x, y: jnp.where(part == 1, x, y), pick(afters), b)
-        state = jax.tree.map(
-            lambda x, y: jnp.where(part == 1, x, y), after, State(state.q, state.v)
-        )
-        return state
+        within = state_within(model, begin, end, h, part, run.order)
+        state = State(within.q, within.v)
+        if steps.happening is None:
+            return state
+        at_end = lambda x, y: jnp.where(part == 1, x, y)
+        return jax.tree.map(at_end, pick(afters), state)
 
     return jax.lax.map(state_at, rows)
 

@@ -183,8 +183,6 @@ def _run(task: Task) -> tuple[Solution, Scalar]:
         order=task.scheme.order,
     )
     rows = saving.rows(run)
-    solution = task.solution(model, rows, end)
-    if task.watcher is not None:
-        happened = task.events(model, record, rows.multipliers)
-        solution = dataclasses.replace(solution, events=happened)
+    happened = task.events(model, record, rows.multipliers)
+    solution = dataclasses.replace(task.solution(model, rows, end), events=happened)
     return solution, plan.time(end.place)
