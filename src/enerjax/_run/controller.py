@@ -1,5 +1,6 @@
 """Steps whose lengths are chosen by an estimate of their errors."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -244,6 +245,10 @@ class _ControlledPlan(AbstractPlan):
     @property
     def numbers(self) -> PyTree[Any]:
         return self.t0, self.t1, self.first_length, self.controller
+
+    def with_events(self, attempts: int) -> "_ControlledPlan":
+        more = self.max_attempts + attempts
+        return dataclasses.replace(self, max_attempts=more, is_counted=False)
 
     def rounded_up(self) -> "_ControlledPlan":
         # Its bound on the attempts does not depend on the length of the run.

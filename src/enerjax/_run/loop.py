@@ -299,7 +299,7 @@ def _after_event(
     verdict: Verdict,
     state: State,
     place: Scalar,
-    happens: Flag,
+    happens: Array,
 ) -> PyTree[Any]:
     """The memory of the plan after a step, which an event may have ended."""
     plan = stepper.plan

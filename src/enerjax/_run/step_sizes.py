@@ -130,13 +130,9 @@ class AbstractPlan(eqx.Module):
         Runs with the same numbers make the same steps, up to the end of the shorter one.
         """
 
+    @abc.abstractmethod
     def with_events(self, attempts: int) -> "AbstractPlan":
         """The same steps, some of which end early; `attempts` more may be needed."""
-        more = self.max_attempts + attempts
-        changes: dict[str, Any] = dict(max_attempts=more, is_counted=False)
-        if isinstance(self, _EqualPlan):
-            changes["may_end_early"] = True
-        return dataclasses.replace(self, **changes)
 
     def unlimited(self) -> "AbstractPlan":
         """The same steps, without a limit on their number."""
@@ -264,6 +260,11 @@ class _EqualPlan(AbstractPlan):
     @property
     def numbers(self) -> PyTree[Any]:
         return self.t0, self.unit
+
+    def with_events(self, attempts: int) -> "_EqualPlan":
+        more = self.max_attempts + attempts
+        changes = dict(max_attempts=more, is_counted=False, may_end_early=True)
+        return dataclasses.replace(self, **changes)
 
     def rounded_up(self) -> "_EqualPlan":
         if is_known(self.last) and self.last > self.max_attempts:

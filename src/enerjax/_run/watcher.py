@@ -145,8 +145,7 @@ class Watcher(eqx.Module):
             return values
 
         def with_forces(values: Array) -> Array:
-            timed = State(state.q, state.v, t if model.system.is_timed else None)
-            _, multipliers = model.accelerations(timed)
+            _, multipliers = model.accelerations(_timed(model, state, t))
             forces = self.impacts.forces(model, state.q, multipliers)
             forces = self._of_events(forces).astype(values.dtype)
             return jnp.where(self.closed(model), forces, values)
@@ -398,9 +397,7 @@ class Watcher(eqx.Module):
     ) -> Watch:
         """What is known at the start of the next step, after an accepted one, and after the
         events that happen at its end."""
-        state = State(
-            changed.state.q, changed.state.v, t if model.system.is_timed else None
-        )
+        state = _timed(model, changed.state, t)
         values = found.values
         if self.changes_state.any():
 
@@ -444,8 +441,12 @@ class Watcher(eqx.Module):
 
 def inner_state(model: AbstractModel, state: State, t: Scalar) -> State:
     """The state in rates, with its time if the system depends on it."""
-    timed = State(state.q, state.v, t if model.system.is_timed else None)
-    return model.to_rates(timed)
+    return model.to_rates(_timed(model, state, t))
+
+
+def _timed(model: AbstractModel, state: State, t: Scalar) -> State:
+    """The state with its time, if the system depends on it."""
+    return State(state.q, state.v, t if model.system.is_timed else None)
 
 
 def _motion_between(
