@@ -160,13 +160,8 @@ class Follower(AbstractForce):
         return Following(Place(), self.force, feedback), ends.point_of_body(self.point)
 
 
-class Torque(AbstractForce):
-    """A torque on a `body` in space that a function defines: `torque(t, args)`.
-
-    It is a vector in space, and it has no potential: what it does depends on the way. In
-    the plane use a `TorsionActuator` between the ground and the body. With feedback it is a
-    `torque(view, t, args)`; see `Actuator`.
-    """
+class AbstractTorque(AbstractForce):
+    """A torque on a body in space."""
 
     torque: ForceFunction
 
@@ -175,21 +170,22 @@ class Torque(AbstractForce):
 
     def __check_init__(self):
         takes_view(self.name, "torque", self.torque)
+
+
+class Torque(AbstractTorque):
+    """A torque on a `body` in space that a function defines: `torque(t, args)`.
+
+    It is a vector in space, and it has no potential: its work depends on the path. In
+    the plane use a `TorsionActuator` between the ground and the body. With feedback it is a
+    `torque(view, t, args)`; see `Actuator`.
+    """
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         return _turning(ends, self.name, self.torque, follows=False), {}
 
 
-class FollowerTorque(AbstractForce):
+class FollowerTorque(AbstractTorque):
     """A torque that turns with its `body`: a `Torque` in the axes of the body."""
-
-    torque: ForceFunction
-
-    def __init__(self, name: str, body: str, torque: ForceFunction):
-        self.name, self.a, self.b, self.torque = name, GROUND, body, torque
-
-    def __check_init__(self):
-        takes_view(self.name, "torque", self.torque)
 
     def resolve(self, ends: Ends) -> tuple[AbstractLaw, Numbers]:
         return _turning(ends, self.name, self.torque, follows=True), {}
