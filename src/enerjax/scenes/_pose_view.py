@@ -14,6 +14,11 @@ from ._laws import AbstractNonholonomicLaw
 from ._layout import Layout, Links
 
 
+# Frames of less than this part of the bodies are computed for these bodies alone: a pin at
+# one end of a beam needs no axes of all of its sections.
+_FEW = 0.25
+
+
 def rows(x: Array, index: np.ndarray) -> Array:
     """`x[index]`, which is a slice if the indices are consecutive."""
     first = index.flat[0]
@@ -35,8 +40,7 @@ class View:
 
     @cached_property
     def origins(self) -> Float[Array, "bodies d"]:
-        ground = jnp.zeros((1, self.layout.dimension), self.q.dtype)
-        return self._table("origin", ground)
+        return self._table("origin")
 
     @cached_property
     def axes(self) -> Float[Array, "bodies d d"]:
@@ -48,7 +52,9 @@ class View:
 
         To find an axis in a table takes longer than to turn one.
         """
-        axes = self._table("axes", jnp.eye(self.layout.dimension, dtype=self.q.dtype)[None])
+        return self._without_second(self._table("axes"))
+
+    def _without_second(self, axes: Float[Array, "n d d"]) -> Float[Array, "n m d"]:
         return axes[:, :1] if self.layout.dimension == 2 else axes
 
     def _with_second(self, first: Float[Array, "n m d"]) -> Float[Array, "n d d"]:
@@ -59,13 +65,36 @@ class View:
 
     @cached_property
     def angles(self) -> Float[Array, " bodies"]:
-        return self._table("angle", jnp.zeros((1,), self.q.dtype))
+        return self._table("angle")
 
-    def _table(self, field: str, ground: Array) -> Array:
-        parts = [ground]
+    def _table(self, field: str, only: np.ndarray | None = None) -> Array:
+        """A field of the ground and of all bodies, or of `only` these, in their order."""
+        dimension, dtype = self.layout.dimension, self.q.dtype
+        of_ground = {
+            "origin": jnp.zeros((1, dimension), dtype),
+            "axes": jnp.eye(dimension, dtype=dtype)[None],
+            "angle": jnp.zeros((1,), dtype),
+        }
+        parts, first = [of_ground[field]], 1
         for group in self.layout.body_groups:
-            parts.append(jax.vmap(getattr(group.kind, field))(rows(self.q, group.q)))
+            count = len(group.names)
+            chosen = np.arange(count) if only is None else only - first
+            chosen = chosen[(chosen >= 0) & (chosen < count)]
+            first += count
+            if chosen.size > 0:
+                q = rows(self.q, group.q[chosen])
+                parts.append(jax.vmap(getattr(group.kind, field))(q))
         return jnp.concatenate(parts)
+
+    def _of(self, field: str, table: str, bodies: np.ndarray) -> Array:
+        """A field of some bodies, stacked; that of a few is computed for these alone."""
+        few = np.unique(bodies[bodies > 0])
+        if few.size > _FEW * len(self.layout.turning):
+            return rows(getattr(self, table), bodies)
+        found = self._table(field, few)
+        if field == "axes":
+            found = self._without_second(found)
+        return rows(found, np.where(bodies > 0, 1 + np.searchsorted(few, bodies), 0))
 
     def frames(self, bodies: np.ndarray, reads: tuple[str, ...]) -> Frame:
         """The frames of some bodies, stacked, with the fields that are read."""
@@ -73,15 +102,15 @@ class View:
         if "origin" in reads:
             fields["origin"] = self._origins_of(bodies)
         if "axes" in reads and self.layout.turning[bodies].any():
-            fields["axes"] = self._with_second(rows(self._first_axes, bodies))
+            fields["axes"] = self._with_second(self._of("axes", "_first_axes", bodies))
         if "angle" in reads:
-            fields["angle"] = rows(self.angles, bodies)
+            fields["angle"] = self._of("angle", "angles", bodies)
         return Frame(**fields)
 
     def _origins_of(self, bodies: np.ndarray) -> Array:
         if not bodies.any():  # all on the ground
             return jnp.zeros((bodies.size, self.layout.dimension), self.q.dtype)
-        return rows(self.origins, bodies)
+        return self._of("origin", "origins", bodies)
 
     def frame(self, body: str) -> Frame:
         """The frame of one body, with all its fields."""
