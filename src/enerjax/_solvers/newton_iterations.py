@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
+from .._programs import unmerged
 from .._types import Count, Flag, Scalar
 from .linear.dense import AbstractFactors
 from .linear.jacobian import Linearisable
@@ -248,7 +249,7 @@ class _Verdict(NamedTuple):
 def _propose(
     residual: Linearisable, iterate: _Iterate, least: Scalar, powers: Powers
 ) -> _Correction:
-    value = residual.value(iterate.x)
+    value, defect = _value_and_size(residual, iterate.x)
     step = iterate.factors.solve(value)
     x = iterate.x - step
     size = correction_size(step, x, least, powers)
@@ -260,8 +261,23 @@ def _propose(
         size=size,
         contraction=contraction,
         shrinks=shrinks,
-        defect=max_norm(value),
+        defect=defect,
     )
+
+
+def _value_and_size(
+    residual: Linearisable, x: Float[Array, " n"]
+) -> tuple[Float[Array, " n"], Scalar]:
+    """The residual, and its largest entry."""
+
+    def both(x: Array) -> tuple[Array, Array]:
+        value = residual.value(x)
+        return value, max_norm(value)
+
+    # XLA would otherwise evaluate parts of the residual again for each of its uses in the
+    # substitution.
+    value, defect = (both if residual.is_dense else unmerged(both))(x)
+    return value, defect
 
 
 def _classify(

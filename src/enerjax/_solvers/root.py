@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._programs import in_one_function, is_known
 from .._types import Flag, Scalar
-from .linear.dense import AbstractFactors
+from .linear.dense import AbstractFactors, SMALL
 from .linear.jacobian import Linearisable, linearisable
 from .newton import Newton, Start
 from .root_finding import Chord, flat_of, flattened, Root, RootFinder, search
@@ -54,7 +54,13 @@ def _root_jvp(primals, tangents):
     linear_solver = root_finder.linear_solver if isinstance(root_finder, Newton) else None
     regularisation = flat_of(args[-1])
     linear = linearisable(
-        flat_fn, flat, args, linear_solver, regularisation, rarely=start.rarely
+        flat_fn,
+        flat,
+        args,
+        linear_solver,
+        regularisation,
+        rarely=start.rarely,
+        small=SMALL if chord is None else 0,
     )
     change = linear.solve(flat, -rate)
     if regularisation is not None:

@@ -14,7 +14,7 @@ from typing_extensions import TypeAliasType
 from .._programs import in_one_function, unmerged
 from .._types import Count, Flag, Scalar
 from .chord_iterations import chord_iterations
-from .linear.dense import AbstractFactors, Inverse
+from .linear.dense import AbstractFactors, Inverse, SMALL
 from .linear.jacobian import Linearisable, linearisable
 from .newton import Newton, Start
 from .newton_iterations import max_norm, newton_iterations
@@ -103,7 +103,13 @@ def search(
     flat, _, flat_fn = flattened(fn, start.guess)
     linear_solver, regularisation = root_finder.linear_solver, flat_of(start.regularisation)
     exact = linearisable(
-        flat_fn, flat, args, linear_solver, regularisation, rarely=start.rarely
+        flat_fn,
+        flat,
+        args,
+        linear_solver,
+        regularisation,
+        rarely=start.rarely,
+        small=SMALL if chord is None else 0,
     )
     if chord is None or linear_solver is not None:
         return _iterated(exact, root_finder, start, max_iterations)

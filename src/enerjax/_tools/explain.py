@@ -13,7 +13,7 @@ from .._run.loop import Stepper
 from .._run.stage import free_flight, step_problem
 from .._run.step import model_for
 from .._run.step_sizes import End, EqualSteps
-from .._solvers import flattened, linearisable, Newton, RootFinder
+from .._solvers import flattened, linearisable, Newton, RootFinder, SMALL
 from .._system import AbstractSystem, State
 from .._types import Args, Scalar
 from ..schemes import AbstractScheme
@@ -117,7 +117,12 @@ def _explained(
     if isinstance(root_finder, Newton):
         redundant = jnp.ones_like(flat) if model.system.redundant else None
         form = linearisable(
-            equations, flat, (scheme.stage, problem), root_finder.linear_solver, redundant
+            equations,
+            flat,
+            (scheme.stage, problem),
+            root_finder.linear_solver,
+            redundant,
+            small=0 if by_chord else SMALL,
         ).form
         jacobian = form.description(flat.size)
     newton = "Newton's method" if isinstance(root_finder, Newton) else jacobian

@@ -16,9 +16,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array, Float
 
 from ..jaxprs import evaluate, interpret
+from ..one_function.api import unmerged
 from ..one_function.possible import LARGEST_SUM
 from ..primitives import ARITHMETIC, JIT
 from .data_movement import MOVES
@@ -57,8 +59,27 @@ def batched_columns(
 
     They take longer to compute, but their program is compiled several times as fast.
     """
-    push = lambda seed: jax.jvp(fn, (x,), (seed,))[1]
+    push = _push_apart(fn, x)
     return jax.vmap(push, in_axes=1, out_axes=-1)(jnp.asarray(seeds, x.dtype))
+
+
+def _push_apart(
+    fn: Callable[[Array], Array], x: Float[Array, " n"]
+) -> Callable[[Array], Array]:
+    """The linear map of `fn` at `x`, whose coefficients are computed once.
+
+    XLA would otherwise compute them, such as sines of angles, again for every column.
+    """
+    programs: list[Any] = []
+
+    def coefficients(x: Array) -> tuple[Array, ...]:
+        program = jax.make_jaxpr(jax.linearize(fn, x)[1])(x)
+        programs.append(program.jaxpr)
+        return tuple(map(jnp.asarray, program.consts)) + (x, x)
+
+    *consts, _, _ = unmerged(coefficients)(x)
+    push = jaxpr_as_fun(ClosedJaxpr(programs[-1], consts))
+    return lambda seed: push(seed)[0]
 
 
 class _Columns:

@@ -19,7 +19,7 @@ import scipy
 from jaxtyping import Array, Float, Int
 
 from ..._programs import batched_columns, columns_along, in_one_function, shape_of
-from .dense import AbstractFactors
+from .dense import AbstractFactors, SMALL
 from .elimination import apply_reduction, eliminate_columns, LAPACK_FROM
 
 
@@ -75,7 +75,10 @@ class Band:
 
     def is_cheaper_than_dense(self) -> bool:
         """Whether the block elimination needs less work than that of the dense matrix."""
+        # The time of a multiplication, in those of a dense elimination: by LAPACK, or of a
+        # small matrix in plain operations.
         cost = 40 if self.width < LAPACK_FROM else 8
+        cost = cost if self.size > SMALL else 10
         return cost * self.num_blocks * self.width**3 < self.size**3
 
     def empty(self, size: int, dtype: Any) -> "BandFactors":

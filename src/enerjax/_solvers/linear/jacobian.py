@@ -177,12 +177,14 @@ def linearisable(
     regularisation: Float[Array, " n"] | None = None,
     *,
     rarely: bool = False,
+    small: int = SMALL,
 ) -> Linearisable:
     """`fn(x, args)` as a function of `x`. All traced values must be passed in `args`.
 
     By default the size and the sparsity of the Jacobian determine the linear solver. The
     `regularisation` is added to the diagonal of a Jacobian that may be singular. If the
-    Jacobian is needed `rarely`, its program is one that compiles quickly.
+    Jacobian is needed `rarely`, its program is one that compiles quickly. Structure is
+    searched for where there are more unknowns than `small`.
     """
     value = plain_products(fn, like, args)
     if isinstance(linear_solver, lx.AbstractLinearSolver):
@@ -194,7 +196,7 @@ def linearisable(
         pattern = jacobian_pattern(regularised, like)
         form = Sparse(linear_solver, pattern, like.size)
         return Linearisable(value, form, regularisation)
-    pattern = jacobian_pattern(regularised, like) if like.size > LARGE else None
+    pattern = jacobian_pattern(regularised, like) if like.size > small else None
     if pattern is None:
         return Linearisable(value, Dense(None, rarely=rarely), regularisation)
     band = Band(pattern, rarely)
