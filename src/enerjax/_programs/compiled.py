@@ -1,7 +1,7 @@
 """Compilation of the programs that users wait for."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, ParamSpec, TypeAlias, TypeVar
 
 import equinox as eqx
@@ -66,12 +66,40 @@ class Readable:
     @functools.cached_property
     def _jitted(self) -> Any:
         def of_parts(static: _Static, arrays: list[Array]) -> PyTree[Array]:
-            inputs, (_, leaves), structure = iter(arrays), *static
-            values = (next(inputs) if x is None else x for x in leaves)
-            return self._fn(*jax.tree.unflatten(structure, values))
+            return self._fn(*_joined(static, arrays))
 
         options = _QUICKLY if _are_known() else None
         return jax.jit(of_parts, static_argnums=0, compiler_options=options)
+
+
+def once_per_structure(check: Callable[..., None]) -> Callable[..., None]:
+    """A check of shapes and types that is not repeated for arguments of the same structure.
+
+    To trace the functions of a user takes milliseconds, which would be most of a short run.
+    Inside of transformations every call checks.
+    """
+
+    @functools.lru_cache(maxsize=128)
+    def of_types(static: _Static, types: tuple[jax.ShapeDtypeStruct, ...]) -> None:
+        check(*_joined(static, types))
+
+    @functools.wraps(check)
+    def call(*args: Any) -> None:
+        static, arrays = _parts(args)
+        if not at_top_level(args) or not _is_hashable(static):
+            return check(*args)
+        types = (jax.ShapeDtypeStruct(np.shape(x), x.dtype) for x in arrays)
+        return of_types(static, tuple(types))
+
+    return call
+
+
+def _is_hashable(x: Any) -> bool:
+    try:
+        hash(x)
+    except TypeError:
+        return False
+    return True
 
 
 _Static: TypeAlias = tuple[tuple[tuple[Any, ...], tuple[Any, ...]], Any]
@@ -85,6 +113,13 @@ def _parts(tree: PyTree[Any]) -> tuple[_Static, list[Array]]:
     static = tuple(None if on else x for on, x in zip(is_array, leaves, strict=True))
     # 1, 1.0 and True are equal, but make different programs.
     return ((tuple(map(type, static)), static), structure), arrays
+
+
+def _joined(static: _Static, arrays: Iterable[Any]) -> Any:
+    """The tree of which `_parts` has made these parts."""
+    inputs, (_, leaves), structure = iter(arrays), *static
+    values = (next(inputs) if x is None else x for x in leaves)
+    return jax.tree.unflatten(structure, values)
 
 
 _zero = jax.jit(lambda: 0.0)

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from ..._programs import once_per_structure
 from ..._types import Args
 from ..base import AbstractSystem, SIGNATURES, State
 from ..canonical import HamiltonianSystem, LagrangianSystem
@@ -78,6 +79,7 @@ def _kind(args: Any) -> str:
     return "None" if args is None else f"of type {type(args).__name__}"
 
 
+@once_per_structure
 def check_shapes(system: AbstractSystem, state: State, args: Args) -> None:
     internal = _internal_rows(system, state)
     for role, fn, inputs in energies(system, state, args):
