@@ -48,10 +48,10 @@ class Newton(eqx.Module):
     - `linear_solver`: the solver for the corrections and for derivatives of the root. An
       `AbstractSparseSolver`, such as `KLU()`, receives the structurally nonzero entries of
       the Jacobian; a solver of lineax receives the dense Jacobian. By default the size and
-      the sparsity decide: up to 32 unknowns plain array operations, beyond that LAPACK,
-      and above 64 unknowns a banded solver if the unknowns can be ordered such that the
-      Jacobian is a narrow band. Derivatives are as accurate as
-      the solutions of the solver.
+      the sparsity decide. Up to 32 unknowns, or 16 where the chord method is tried first,
+      it is an inverse in plain array operations. Beyond that it is a banded solver if the
+      unknowns can be ordered such that the Jacobian is a narrow band, else LAPACK.
+      Derivatives are as accurate as the solutions of the solver.
 
     Raises a `TypeError` for a `linear_solver` of another type, and a `ValueError` for a
     bound that is not positive.
