@@ -33,7 +33,9 @@ class _OfStrains(eqx.Module):
             )
         return strains.reshape(-1)
 
-    def stresses(self, strains: Float[Array, " m"], k: Any, args: Args) -> Float[Array, " m"]:
+    def stresses(
+        self, strains: Float[Array, " m"], k: Any, args: Args
+    ) -> Float[Array, " m"]:
         stiffness = jnp.asarray(self.stiffness(k, args), strains.dtype)
         count = strains.size
         if stiffness.shape not in ((), (count,), (count, count)):
