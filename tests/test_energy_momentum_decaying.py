@@ -7,7 +7,7 @@ import pytest
 
 import enerjax as ej
 
-from .helpers import EPS, slopes
+from .helpers import EPS, follow, problem, slopes
 
 
 def stretch(x, k, args):
@@ -90,6 +90,7 @@ def test_energy_law_momenta_and_constraints_hold_to_round_off(alpha, k):
     assert lost == 0 if alpha == 0 else lost > (1e-3 if k > 1e3 else 1e-8)
 
 
+@pytest.mark.slow
 def test_energy_decaying_loses_angular_momentum_there():
     args = numbers(1e6)
     start, scheme = spinning(LINKED, args), ej.EnergyDecaying(0.5)
@@ -134,14 +135,10 @@ def test_on_a_linear_oscillator_it_is_energy_consistent():
 def test_the_order_is_two():
     """Against `EnergyConsistent(0)`, of order 4, with a third of the shortest step."""
     args = numbers(50.0)
-    start = spinning(LINKED, args)
+    start = spinning(FREE, args)
 
     def end(scheme, steps):
-        every = ej.SaveAt(every=steps)
-        sol = ej.simulate(
-            LINKED, scheme, start, args, h=0.4 / steps, num_steps=steps, saveat=every
-        )
-        return sol.ys.q[-1]
+        return follow(FREE, scheme, start, args, h=0.4 / steps, steps=steps)[0].q
 
     exact = end(ej.EnergyConsistent(0.0, ej.MeanValue()), 240)
     scheme = ej.EnergyMomentumDecaying(0.7)
@@ -150,26 +147,81 @@ def test_the_order_is_two():
     np.testing.assert_allclose(slopes(errors), 2.0, atol=0.1)
 
 
-def test_gradients_of_a_run():
-    """By the stiffness, alpha and the start, in both modes and against differences."""
+@pytest.mark.slow
+def test_the_order_is_two_however_stiff_springs_are():
+    """Here `h w` is between 50 and 1000. `EnergyDecaying` is of order 1 and less."""
+    args = numbers(1e8)
+    v = np.cross([0.0, 0.7, 2.0], PLACES)
+    start = ej.initial_state(FREE, PLACES.ravel(), v.ravel(), args)
+    errors = {}
+    for make in (ej.EnergyMomentumDecaying, ej.EnergyDecaying):
+        ends = [
+            follow(FREE, make(0.5), start, args, h=0.32 / n, steps=n)[0].q
+            for n in (20, 40, 80, 160)
+        ]
+        errors[make] = [float(jnp.max(jnp.abs(x))) for x in np.diff(ends, axis=0)]
+    orders = slopes(errors[ej.EnergyMomentumDecaying])
+    np.testing.assert_allclose(orders, 2.0, atol=0.1)
+    assert np.all(slopes(errors[ej.EnergyDecaying]) < 1.2)
+
+
+def test_stiff_parts_that_turn_lose_nothing():
+    """Two points with a spring of `h w = 1400` that turn about their middle: one by hand.
+
+    The exact motion turns by one radian, and the spring oscillates by `1/(4 k)` of its
+    length. `EnergyConsistent` takes its jump from the linear force, and stops the motion.
+    """
+    spring = ej.Elements.from_strains(
+        lambda x, k, args: jnp.sqrt(jnp.sum((x[:2] - x[2:]) ** 2)) - 1,
+        lambda k, args: args,
+        [[0, 1, 2, 3]],
+    )
+    system = ej.System(jnp.eye(4), spring)
+    start = ej.State(jnp.array([0.5, 0, -0.5, 0]), jnp.array([0, 0.5, 0, -0.5]))
+    lost, angles = {}, {}
+    for make in (ej.EnergyMomentumDecaying, ej.EnergyConsistent):
+        sol = ej.simulate(system, make(1.0), start, 1e8, h=0.1, num_steps=10)
+        lost[make] = 1 - float(sol.audit.energy[-1] / sol.audit.energy[0])
+        angles[make] = float(jnp.arctan2(sol.ys.q[-1, 1], sol.ys.q[-1, 0]))
+    assert 0 < lost[ej.EnergyMomentumDecaying] < 1e-8
+    # The error of the rotation of a rigid body in each step is that of `2 atan(h w / 2)`.
+    expected = 20 * np.arctan(0.05)
+    assert angles[ej.EnergyMomentumDecaying] == pytest.approx(expected, abs=1e-6)
+    assert lost[ej.EnergyConsistent] > 0.9
+    assert angles[ej.EnergyConsistent] < 0.5
+
+
+def gradients_agree(system, rtol):
+    """By alpha, the stiffness and the start, in both modes and against differences."""
+    begin = spinning(system, numbers(400.0))
 
     def end(p):
         alpha, k, push = p
-        args = numbers(k)
-        v = spinning(LINKED, args).v.at[0].add(push)
-        start = ej.initial_state(LINKED, PLACES.ravel(), v, args)
+        start = ej.State(begin.q, begin.v.at[0].add(push))
+        start = ej.initial_state(system, start.q, start.v, numbers(k))
         scheme = ej.EnergyMomentumDecaying(alpha)
-        sol = ej.simulate(LINKED, scheme, start, args, h=0.02, num_steps=10, throw=False)
+        sol = ej.simulate(
+            system, scheme, start, numbers(k), h=0.02, num_steps=10, throw=False
+        )
         return jnp.sum(sol.ys.q[-1] * jnp.cos(jnp.arange(12.0)))
 
     p = jnp.array([0.5, 400.0, 0.0])
     value = jax.jit(end)
     reverse, forward = jax.jit(jax.grad(end))(p), jax.jit(jax.jacfwd(end))(p)
     np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-13)  # solver
-    steps = np.diag([1e-5, 1e-2, 1e-5])
+    steps = np.diag([1e-4, 1e-1, 1e-4])
     by_differences = [(value(p + x) - value(p - x)) / (2 * x.sum()) for x in steps]
     assert np.min(np.abs(reverse)) > 1e-7
-    np.testing.assert_allclose(reverse, by_differences, rtol=1e-5, atol=1e-10)  # truncation
+    np.testing.assert_allclose(reverse, by_differences, rtol=rtol)  # truncation
+
+
+def test_gradients_of_a_run():
+    gradients_agree(FREE, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_gradients_of_a_run_with_constraints():
+    gradients_agree(LINKED, rtol=1e-4)
 
 
 @pytest.mark.slow
@@ -241,22 +293,19 @@ def test_hinged_rigid_bodies_keep_their_angular_momentum():
     second = 0.5 * inertia.sum() - inertia
     spin = np.einsum("i,tnij->tj", second, np.cross(q[:, :, 1:], v[:, :, 1:]))
     angular = np.cross(q[:, :, 0], v[:, :, 0]).sum(axis=1) + spin
-    assert np.max(np.abs(angular)) > 1
-    assert np.max(np.abs(angular - angular[0])) <= 200 * EPS
+    assert np.max(np.abs(angular)) > 0.3
+    assert np.max(np.abs(angular - angular[0])) <= 100 * EPS
     assert np.max(np.abs(sol.audit.leak)) <= 1e3 * EPS
     assert np.sum(sol.audit.dissipated) > 1e-6
 
 
 def test_what_it_cannot_damp_is_refused():
     scheme = ej.EnergyMomentumDecaying(0.5)
-    system, start, args = ej.problems.pendulum()
+    system, start, args = problem("pendulum")
     with pytest.raises(ValueError, match="damps strains, and this system has none"):
         ej.step(system, scheme, start, args, h=0.01)
-    for make, has in (
-        (ej.problems.heavy_top, "`kinematics`"),
-        (ej.problems.double_pendulum_angles, "varying inertia"),
-    ):
-        system, start, args = make()
+    for name, has in (("top", "`kinematics`"), ("double angles", "varying inertia")):
+        system, start, args = problem(name)
         with pytest.raises(ValueError, match=has):
             ej.step(system, scheme, start, args, h=0.01)
 

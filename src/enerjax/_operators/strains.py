@@ -39,8 +39,8 @@ class Strains(eqx.Module):
         potential = self.model.system.potential
         if not isinstance(potential, AbstractStrainEnergy):
             return q[:0]
-        parts = potential.strains(q, self.model.args)
-        return jnp.concatenate([q[:0], *(x.ravel() for x in parts)])
+        parts = [x.ravel() for x in potential.strains(q, self.model.args)]
+        return jnp.concatenate(parts) if parts else q[:0]
 
     def stresses(self, strains: Float[Array, " ns"]) -> Float[Array, " ns"]:
         """`K strains`"""
@@ -99,7 +99,7 @@ class Strains(eqx.Module):
         A strain without a gradient has the scale one.
         """
         norms, _ = row_scales(self.values, q, self.model.scales.coordinate)
-        return jax.lax.stop_gradient(jnp.where(norms > 0, norms, 1.0))
+        return jnp.where(norms > 0, norms, 1.0)
 
     def _energy(
         self, x: Float[Array, " ns"] | None, y: Float[Array, " ns"]

@@ -1,4 +1,5 @@
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -145,13 +146,13 @@ class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
         unit = root * strains.scales(start.q)
         stiff = jnp.abs(h / 6 * strains.stresses(jnp.abs(h) * unit))
         scale = root**2 / unit
-        return _Problem(step, scale, scale + stiff)
+        return _Problem(step, *jax.lax.stop_gradient((scale, scale + stiff)))
 
     def predict(
         self, problem: _Problem, acceleration: Velocities, multipliers: Multipliers
     ) -> _Unknowns:
         end = problem.step.guess(acceleration, multipliers)
-        none = end.rate[:0]
+        none = jnp.zeros((0,), end.rate.dtype)
         jump = Increment(none, none, none, jnp.zeros_like(end.velocity_impulse))
         return _Unknowns(jnp.zeros_like(problem.scale), jump, end)
 
