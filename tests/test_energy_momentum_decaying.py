@@ -63,6 +63,19 @@ def momenta(ys):
 
 
 FREE, LINKED = points(rods=False), points(rods=True)
+# Two points in the plane with a spring of length one between them.
+PAIR = ej.System(
+    jnp.eye(4),
+    ej.Elements.from_strains(
+        lambda x, k, args: jnp.sqrt(jnp.sum((x[:2] - x[2:]) ** 2)) - 1,
+        lambda k, args: args,
+        [[0, 1, 2, 3]],
+    ),
+)
+PAIR_START = ej.State(jnp.array([0.5, 0, -0.5, 0]), jnp.array([0, 0.5, 0, -0.5]))
+OSCILLATOR = ej.System(
+    jnp.eye(1), ej.Elements.from_strains(lambda x, k, args: x, lambda k, args: 1e8, [[0]])
+)
 
 
 @jax.jit
@@ -102,13 +115,9 @@ def test_energy_decaying_loses_angular_momentum_there():
 @pytest.mark.parametrize("alpha", [0.0, 0.5, 1.0])
 def test_the_spectral_radius_of_an_oscillator(alpha):
     """Amplitudes of an oscillation that is 1e4 times faster than the step."""
-    system = ej.System(
-        jnp.eye(1),
-        ej.Elements.from_strains(lambda x, k, args: x, lambda k, args: 1e8, [[0]]),
-    )
     start = ej.State(jnp.ones(1), jnp.zeros(1))
     scheme = ej.EnergyMomentumDecaying(alpha)
-    sol = ej.simulate(system, scheme, start, h=1.0, num_steps=2)
+    sol = ej.simulate(OSCILLATOR, scheme, start, h=1.0, num_steps=2)
     sizes = np.hypot(1e4 * np.asarray(sol.ys.q)[:, 0], np.asarray(sol.ys.v)[:, 0])
     expected = (1 - alpha) / (1 + alpha)
     assert sizes[2] / sizes[1] == pytest.approx(expected, abs=4e-4)  # of order 1/(h w)
@@ -116,6 +125,7 @@ def test_the_spectral_radius_of_an_oscillator(alpha):
     assert float(of_radius.alpha) == pytest.approx(alpha, abs=4 * EPS)
 
 
+@pytest.mark.slow
 def test_on_a_linear_oscillator_it_is_energy_consistent():
     """Two coupled oscillators with a full stiffness matrix, at order one times `h w`."""
     matrix = np.array([[3.0, -1.0], [-1.0, 2.0]])
@@ -134,17 +144,16 @@ def test_on_a_linear_oscillator_it_is_energy_consistent():
 
 def test_the_order_is_two():
     """Against `EnergyConsistent(0)`, of order 4, with a third of the shortest step."""
-    args = numbers(50.0)
-    start = spinning(FREE, args)
+    start = ej.State(PAIR_START.q * 1.1, PAIR_START.v * 2)
 
     def end(scheme, steps):
-        return follow(FREE, scheme, start, args, h=0.4 / steps, steps=steps)[0].q
+        return follow(PAIR, scheme, start, 50.0, h=0.4 / steps, steps=steps)[0].q
 
     exact = end(ej.EnergyConsistent(0.0, ej.MeanValue()), 240)
     scheme = ej.EnergyMomentumDecaying(0.7)
     errors = [float(jnp.max(jnp.abs(end(scheme, n) - exact))) for n in (20, 40, 80)]
     assert errors[-1] < 1e-4
-    np.testing.assert_allclose(slopes(errors), 2.0, atol=0.1)
+    np.testing.assert_allclose(slopes(errors), 2.0, atol=0.15)
 
 
 @pytest.mark.slow
@@ -165,22 +174,16 @@ def test_the_order_is_two_however_stiff_springs_are():
     assert np.all(slopes(errors[ej.EnergyDecaying]) < 1.2)
 
 
+@pytest.mark.slow
 def test_stiff_parts_that_turn_lose_nothing():
     """Two points with a spring of `h w = 1400` that turn about their middle: one by hand.
 
     The exact motion turns by one radian, and the spring oscillates by `1/(4 k)` of its
     length. `EnergyConsistent` takes its jump from the linear force, and stops the motion.
     """
-    spring = ej.Elements.from_strains(
-        lambda x, k, args: jnp.sqrt(jnp.sum((x[:2] - x[2:]) ** 2)) - 1,
-        lambda k, args: args,
-        [[0, 1, 2, 3]],
-    )
-    system = ej.System(jnp.eye(4), spring)
-    start = ej.State(jnp.array([0.5, 0, -0.5, 0]), jnp.array([0, 0.5, 0, -0.5]))
     lost, angles = {}, {}
     for make in (ej.EnergyMomentumDecaying, ej.EnergyConsistent):
-        sol = ej.simulate(system, make(1.0), start, 1e8, h=0.1, num_steps=10)
+        sol = ej.simulate(PAIR, make(1.0), PAIR_START, 1e8, h=0.1, num_steps=10)
         lost[make] = 1 - float(sol.audit.energy[-1] / sol.audit.energy[0])
         angles[make] = float(jnp.arctan2(sol.ys.q[-1, 1], sol.ys.q[-1, 0]))
     assert 0 < lost[ej.EnergyMomentumDecaying] < 1e-8
@@ -191,37 +194,44 @@ def test_stiff_parts_that_turn_lose_nothing():
     assert angles[ej.EnergyConsistent] < 0.5
 
 
-def gradients_agree(system, rtol):
-    """By alpha, the stiffness and the start, in both modes and against differences."""
-    begin = spinning(system, numbers(400.0))
-
-    def end(p):
-        alpha, k, push = p
-        start = ej.State(begin.q, begin.v.at[0].add(push))
-        start = ej.initial_state(system, start.q, start.v, numbers(k))
-        scheme = ej.EnergyMomentumDecaying(alpha)
-        sol = ej.simulate(
-            system, scheme, start, numbers(k), h=0.02, num_steps=10, throw=False
-        )
-        return jnp.sum(sol.ys.q[-1] * jnp.cos(jnp.arange(12.0)))
-
-    p = jnp.array([0.5, 400.0, 0.0])
-    value = jax.jit(end)
+def gradients_agree(end, p, steps, rtol):
+    """In both modes, and against central differences with these steps."""
+    value, rows = jax.jit(end), np.diag(steps)
     reverse, forward = jax.jit(jax.grad(end))(p), jax.jit(jax.jacfwd(end))(p)
-    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-13)  # solver
-    steps = np.diag([1e-4, 1e-1, 1e-4])
-    by_differences = [(value(p + x) - value(p - x)) / (2 * x.sum()) for x in steps]
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9)  # solver
+    by_differences = [(value(p + x) - value(p - x)) / (2 * x.sum()) for x in rows]
     assert np.min(np.abs(reverse)) > 1e-7
     np.testing.assert_allclose(reverse, by_differences, rtol=rtol)  # truncation
 
 
 def test_gradients_of_a_run():
-    gradients_agree(FREE, rtol=1e-5)
+    """By alpha, the stiffness, the start and the step."""
+
+    def end(p):
+        alpha, k, push, h = p
+        start = ej.State(PAIR_START.q * 1.1, PAIR_START.v.at[0].add(push))
+        scheme = ej.EnergyMomentumDecaying(alpha)
+        sol = ej.simulate(PAIR, scheme, start, k, h=h, num_steps=10, throw=False)
+        return sol.ys.q[-1] @ jnp.arange(1.0, 5.0)
+
+    p = jnp.array([0.5, 400.0, 0.1, 0.05])
+    gradients_agree(end, p, [1e-4, 1e-2, 1e-4, 1e-6], rtol=1e-5)
 
 
 @pytest.mark.slow
 def test_gradients_of_a_run_with_constraints():
-    gradients_agree(LINKED, rtol=1e-4)
+    """The start is moved along the constraints."""
+    begin = spinning(LINKED, numbers(400.0))
+
+    def end(p):
+        alpha, k, push = p
+        args, v = numbers(k), begin.v.at[0].add(push)
+        start = ej.initial_state(LINKED, begin.q, v, args)
+        scheme = ej.EnergyMomentumDecaying(alpha)
+        sol = ej.simulate(LINKED, scheme, start, args, h=0.02, num_steps=10, throw=False)
+        return jnp.sum(sol.ys.q[-1] * jnp.cos(jnp.arange(12.0)))
+
+    gradients_agree(end, jnp.array([0.5, 400.0, 0.0]), [1e-4, 0.1, 1e-4], rtol=1e-4)
 
 
 @pytest.mark.slow
