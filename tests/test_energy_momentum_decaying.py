@@ -284,14 +284,17 @@ def test_hinged_rigid_bodies_keep_their_angular_momentum():
     """Free bodies in space that are moved by rotations, with joints and stiff springs."""
     random = np.random.default_rng(1)
     inertia = np.array([0.01, 0.1, 0.1])
-    parts = [
+    bodies = [
         ej.bodies.RigidBody(f"body {k}", 1.0, inertia, [k + 0.5, 0, 0]) for k in range(2)
     ]
-    axes = dict(point_a=[0.5, 0, 0], point_b=[-0.5, 0, 0], axis=[0, 0, 1.0])
-    parts.append(ej.joints.Revolute("hinge", "body 0", "body 1", **axes))
-    ends = dict(point_a=[-0.2, 0.3, 0.1], point_b=[0.1, -0.3, 0.4])
-    parts.append(ej.forces.Spring("spring", "body 0", "body 1", 1e6, **ends))
-    scene = ej.Scene(parts)
+    hinge = ej.joints.Revolute(
+        "hinge", "body 0", "body 1", [0.5, 0, 0], [-0.5, 0, 0], axis=[0, 0, 1.0]
+    )
+    spring = ej.forces.Spring(
+        "spring", "body 0", "body 1", 1e6, point_a=[-0.2, 0.3, 0.1],
+        point_b=[0.1, -0.3, 0.4],
+    )  # fmt: skip
+    scene = ej.Scene([*bodies, hinge, spring])
     start = ej.initial_state(
         scene.system, scene.q, random.normal(size=scene.v.shape), scene.args
     )
