@@ -125,6 +125,19 @@ def test_the_spectral_radius_of_an_oscillator(alpha):
     assert float(of_radius.alpha) == pytest.approx(alpha, abs=4 * EPS)
 
 
+def test_the_spectral_radius_where_a_constraint_holds():
+    """The spring moves two points that a rod keeps together, so its mobility is halved."""
+    system = ej.System(
+        jnp.eye(2),
+        ej.Elements.from_strains(lambda x, k, args: x, lambda k, args: 2e8, [[0]]),
+        lambda q, args: q[:1] - q[1:],
+    )
+    start = ej.State(jnp.ones(2), jnp.zeros(2))
+    sol = ej.simulate(system, ej.EnergyMomentumDecaying(0.5), start, h=1.0, num_steps=2)
+    sizes = np.hypot(1e4 * np.asarray(sol.ys.q)[:, 0], np.asarray(sol.ys.v)[:, 0])
+    assert sizes[2] / sizes[1] == pytest.approx(1 / 3, abs=4e-4)  # of order 1/(h w)
+
+
 @pytest.mark.slow
 def test_on_a_linear_oscillator_it_is_energy_consistent():
     """Two coupled oscillators with a full stiffness matrix, at order one times `h w`."""
