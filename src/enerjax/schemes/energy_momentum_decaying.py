@@ -65,9 +65,8 @@ class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
         E1      = E0 - alpha/2 (g . K g + s . G s)
 
     `G` is the mobility of the strains at the start: `G s` are the rates of the strains that
-    the impulses `s` cause while the joints hold. All terms are discrete gradients of
-    functions of strains, so they conserve what rigid motions of the strains leave
-    unchanged.
+    the impulses `s` cause while the joints hold. Rigid motions do not change strains, and
+    all terms are discrete gradients of functions of strains, so they conserve momenta.
 
     - Conserves: linear and angular momentum, to round-off, for any step length, where
       forces, constraints and the rest of the potential permit it; energy at `alpha = 0`.
