@@ -80,8 +80,8 @@ class System(AbstractSystem):
       `EnergyDecaying`, `EnergyMomentumDecaying` and their compositions move these bodies by
       rotations, with six unknowns each; the first and the third conserve angular momentum
       to round-off where rotations change neither the potential nor the constraints. Other
-      schemes impose six constraints on each body, whose multipliers follow those of `constraint`; they refuse flat bodies,
-      for which `E` is singular.
+      schemes impose six constraints on each body, whose multipliers follow those of
+      `constraint`; they refuse flat bodies, for which `E` is singular.
     - `names`: names of coordinates, velocities and constraints for tables; see `Names`.
     - `events`: events that belong to the system, such as its impacts, in a list. `simulate`
       looks for them in every run.
