@@ -155,6 +155,30 @@ FAULTS = (
         "Multipliers of constraints that repeat each other keep four digits.",
         of("redundant::test_multipliers_are_of_least_norm"),
     ),
+    Fault(
+        "strains: rates at one end",
+        "_operators/strains.py",
+        "discrete_grad(self._energy(x, y))(at(a), at(b))",
+        "discrete_grad(self._energy(x, y))(at(a), (b.q, at(a)[1]))",
+        "The terms of the strain rates are not those of the velocities at both ends.",
+        of("energy_momentum_decaying"),
+    ),
+    Fault(
+        "strains: the mobility of a free body",
+        "schemes/energy_momentum_decaying.py",
+        "jump - model.reaction_at(start.q, start.t, z.jump.velocity_impulse)",
+        "jump",
+        "The joints do not hold where the mobility of strains is computed.",
+        of("energy_momentum_decaying"),
+    ),
+    Fault(
+        "strains: a jump without its stiffness",
+        "schemes/energy_momentum_decaying.py",
+        "        moved = change - self._alpha(h) * jumps.strain\n",
+        "        moved = change\n",
+        "The jump of the strains does not enter that of the momenta.",
+        of("energy_momentum_decaying"),
+    ),
     # Schemes ----------------------------------------------------------------------------
     Fault(
         "forces: the time of the start",

@@ -17,12 +17,14 @@ from .helpers import problem
         (lambda: ej.EnergyDecaying(float("nan")), "alpha"),
         (lambda: ej.KappaDecaying(2.0), "alpha"),
         (lambda: ej.EnergyConsistent(-1e-9), "alpha"),
+        (lambda: ej.EnergyMomentumDecaying(1.5), "alpha"),
         (lambda: ej.EnergyDecaying.from_spectral_radius(1.5), "rho_inf"),
         (lambda: ej.EnergyConsistent.from_spectral_radius(-0.5), "rho_inf"),
         (lambda: ej.Composed(ej.EnergyDecaying(0.5), 4), "symmetric"),
         (lambda: ej.Composed(ej.EnergyDecaying(0.0), 4), "symmetric"),
         (lambda: ej.Composed(ej.KappaDecaying(0.0), 4), "symmetric"),
         (lambda: ej.Composed(ej.EnergyConsistent(0.5), 6), "symmetric"),
+        (lambda: ej.Composed(ej.EnergyMomentumDecaying(0.5), 4), "symmetric"),
         (lambda: ej.Composed(ej.EnergyPreserving(), 5), "order"),
         (lambda: ej.Composed(ej.EnergyPreserving(), 2), "order"),
         (lambda: ej.Composed(ej.EnergyConsistent(0.0), 4), "order"),
@@ -58,7 +60,9 @@ def test_unknown_formulations_are_refused(make, message, is_type_checked):
 def test_a_dissipation_is_a_real_number(alpha, is_type_checked):
     if is_type_checked:
         pytest.skip("the type checker refuses it first")
-    for scheme in (ej.EnergyDecaying, ej.EnergyConsistent, ej.KappaDecaying):
+    for scheme in (
+        ej.EnergyDecaying, ej.EnergyConsistent, ej.EnergyMomentumDecaying, ej.KappaDecaying
+    ):  # fmt: skip
         with pytest.raises(TypeError, match=r"real number in \[0, 1\], got"):
             scheme(alpha)
 

@@ -269,6 +269,20 @@ def test_a_free_beam_in_space_keeps_energy_and_momenta(free, scheme):
 
 
 @pytest.mark.slow
+def test_a_free_beam_keeps_its_momenta_while_it_is_damped(free):
+    scene, start = free
+    scheme = ej.EnergyMomentumDecaying(0.5)
+    sol = ej.simulate(scene.system, scheme, start, scene.args, h=0.02, num_steps=200)
+    for found in _momenta(scene, sol):
+        size = float(jnp.abs(found).max())
+        assert float(jnp.abs(found - found[:1]).max()) < 2e3 * EPS * size  # round-off
+    energy = float(sol.audit.energy[0])
+    np.testing.assert_allclose(sol.audit.leak, 0.0, atol=1e3 * EPS * energy)  # round-off
+    assert jnp.all(sol.audit.dissipated[1:] > 0)
+    assert float(jnp.sum(sol.audit.dissipated)) > 1e-3 * energy
+
+
+@pytest.mark.slow
 def test_a_decaying_scheme_damps_a_free_beam(free):
     scene, start = free
     sol = ej.simulate(

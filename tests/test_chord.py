@@ -1,6 +1,7 @@
 """Chord iterations with inertia and constraints, and Newton's method where they fail."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -74,6 +75,7 @@ CHORDS = {
     "decaying index3": ej.EnergyDecaying(0.4, "index3"),
     "consistent 0": ej.EnergyConsistent(0.0),
     "consistent": ej.EnergyConsistent(0.6),
+    "momentum": ej.EnergyMomentumDecaying(0.6),
 }
 
 
@@ -107,9 +109,16 @@ def test_without_stiffness_one_correction_solves_the_step(name, size):
     count = size // 4
     rows = jnp.asarray(rng.normal(size=(count, 4)))
     mass = jnp.asarray(rng.uniform(0.5, 2, size=size))
+    potential: Any = lambda q, args: 9.81 * jnp.sum(q)
+    if name == "momentum":
+        ends = np.stack([np.arange(size - 1), np.arange(1, size)], axis=1)
+        slack = ej.Elements.from_strains(
+            lambda x, k, args: x[0] - x[1], lambda k, args: 0.0, ends
+        )
+        potential = slack + ej.Elements(lambda x, k, args: 9.81 * x[0], ends[:, :1])
     system = ej.System(
         jnp.diag(mass),
-        lambda q, args: 9.81 * jnp.sum(q),
+        potential,
         lambda q, args: jnp.sum(rows * q.reshape(count, 4), axis=1),
     )
     start = ej.initial_state(system, rng.normal(size=size), rng.normal(size=size))
@@ -118,7 +127,9 @@ def test_without_stiffness_one_correction_solves_the_step(name, size):
     assert left <= 1e4 * EPS  # round-off
 
 
-@pytest.mark.parametrize("name", [x for x in CHORDS if "consistent" not in x])
+@pytest.mark.parametrize(
+    "name", [x for x in CHORDS if "consistent" not in x and x != "momentum"]
+)
 def test_redundant_coordinates_take_one_correction_too(name):
     """With a constant map to the velocities, and constant relations of the coordinates."""
     rng = np.random.default_rng(1)

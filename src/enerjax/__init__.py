@@ -88,6 +88,7 @@ from .schemes import (
     Energies as Energies,
     EnergyConsistent as EnergyConsistent,
     EnergyDecaying as EnergyDecaying,
+    EnergyMomentumDecaying as EnergyMomentumDecaying,
     EnergyPreserving as EnergyPreserving,
     GeneralizedAlpha as GeneralizedAlpha,
     KappaDecaying as KappaDecaying,

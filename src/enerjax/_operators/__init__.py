@@ -11,6 +11,7 @@ from .scaling import (
     shortened as shortened,
 )
 from .separable import SeparableModel as SeparableModel
+from .strains import Strains as Strains
 
 
 def make_model(

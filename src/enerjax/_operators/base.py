@@ -506,14 +506,7 @@ class AbstractModel(eqx.Module):
         q = state.q
         step = self.step_scale(state)
         coordinate = self.coordinate_scale(step)
-        rows = self.constraint_near(q, state.t)
-        pattern = RowPattern(rows, q)
-        entries, columns = pattern.derivative(rows, q), pattern.columns
-        # A bound on the size of the terms. The terms themselves may be zero at the start,
-        # as those of the product of two perpendicular axes.
-        length = lambda rows: jnp.sqrt(jnp.sum(rows**2, axis=1))
-        constraint = length(entries / coordinate[columns])
-        size = constraint * length(pattern.own(coordinate * q))
+        constraint, size = row_scales(self.constraint_near(q, state.t), q, coordinate)
         if self.system.nonholonomic is not None:
             # They have no terms in the position.
             first, last = self._nonholonomic_range(q)
@@ -531,6 +524,22 @@ class AbstractModel(eqx.Module):
     @abc.abstractmethod
     def coordinate_scale(self, step: Increments) -> Coordinates:
         """The scales of the coordinates, given those of the rates of an increment."""
+
+
+def row_scales(
+    rows: Callable[[Coordinates], Array], q: Coordinates, coordinate: Coordinates
+) -> tuple[Array, Array]:
+    """The norm of the gradient of each row of a function, and the size of its terms.
+
+    `coordinate` are the scales of the coordinates.
+    """
+    pattern = RowPattern(rows, q)
+    entries, columns = pattern.derivative(rows, q), pattern.columns
+    # A bound on the size of the terms. The terms themselves may be zero at the start,
+    # as those of the product of two perpendicular axes.
+    length = lambda rows: jnp.sqrt(jnp.sum(rows**2, axis=1))
+    norm = length(entries / coordinate[columns])
+    return norm, norm * length(pattern.own(coordinate * q))
 
 
 # The evaluation of a term takes a few operations, each with a rounding error.

@@ -72,6 +72,11 @@ class Gradient(eqx.Module):
         rows = -load if self.rows is None else self.rows - load
         return Gradient(self.impulse, self.rate, self.work, rows)
 
+    def plus(self, impulse: Coordinates, rows: Increments | None) -> "Gradient":
+        """This gradient with further terms in the coordinates and in the rows."""
+        added = Gradient(self.impulse + impulse, self.rate, self.work, self.rows)
+        return added if rows is None else added.less(-rows)
+
 
 class Scales(eqx.Module):
     """Factors that give rates and impulses the dimension of the square root of an energy.

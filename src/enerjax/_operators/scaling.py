@@ -44,7 +44,8 @@ def scales_like(
         if not is_increment(x):
             return jnp.ones_like(x)
         joint = scales.constraint[: x.velocity_impulse.size]
-        rate = unit / scales.step
+        # Increments without a rate have only multipliers.
+        rate = unit / scales.step if x.rate.size > 0 else x.rate
         momentum = (unit * scales.step)[: x.momentum.size]
         impulse = (unit / scales.constraint)[: x.impulse.size]
         return Increment(impulse, rate, momentum, unit / joint)
@@ -58,6 +59,7 @@ def scales_like(
         position = root * scales.constraint + scales.constraint_size / jnp.abs(h)
         # Likewise, the balance of momentum is limited by the round-off of the forces.
         momentum = jnp.maximum(root * scales.step, _ROUND_OFF_PART * forces)
+        momentum = momentum if x.rate.size > 0 else x.rate
         rate = (root / scales.step)[: x.momentum.size]
         return Increment(position[: x.impulse.size], momentum, rate, root * joint)
 

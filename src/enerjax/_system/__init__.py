@@ -32,3 +32,7 @@ from .kinematics import (
 )
 from .names import Names as Names
 from .separable import System as System
+from .strains import (
+    AbstractStrainEnergy as AbstractStrainEnergy,
+    StrainArrays as StrainArrays,
+)

@@ -77,11 +77,11 @@ class System(AbstractSystem):
       write no constraints for that. Velocities are the rates of all coordinates, and the
       kinetic energy of a body is `m |xdot|^2/2 + sum_ij E_ij d_i_dot . d_j_dot/2` with
       `E = tr(J)/2 I - J` and the inertia `J` in body axes. `EnergyPreserving`,
-      `EnergyDecaying` and their compositions move these bodies by rotations, with six
-      unknowns each, and conserve angular momentum to round-off where rotations change
-      neither the potential nor the constraints. Other schemes impose six constraints on
-      each body, whose multipliers follow those of `constraint`; they refuse flat bodies,
-      for which `E` is singular.
+      `EnergyDecaying`, `EnergyMomentumDecaying` and their compositions move these bodies by
+      rotations, with six unknowns each; the first and the third conserve angular momentum
+      to round-off where rotations change neither the potential nor the constraints. Other
+      schemes impose six constraints on each body, whose multipliers follow those of
+      `constraint`; they refuse flat bodies, for which `E` is singular.
     - `names`: names of coordinates, velocities and constraints for tables; see `Names`.
     - `events`: events that belong to the system, such as its impacts, in a list. `simulate`
       looks for them in every run.

@@ -64,6 +64,13 @@ def resultants(beams: Beams, strains: Array, numbers: Numbers) -> Array:
     return jax.vmap(beams.law.resultants)(strains, numbers)
 
 
+def stresses(
+    beams: Beams, strains: Array, numbers: Numbers
+) -> Float[Array, "beams elements strains"]:
+    """The resultants of elements times their lengths: the derivatives of the energy."""
+    return numbers["length"][:, :, None] * resultants(beams, strains, numbers)
+
+
 def elastic_energy(layout: Layout, view: View, args: Parameters) -> Scalar:
     """The energy of the strains of all beams."""
     energy = jnp.zeros((), view.q.dtype)

@@ -14,12 +14,13 @@ from jaxtyping import Array, Float
 from .._run import Impact
 from .._system import Names, RigidBodies, System
 from .._types import Coordinates, Multipliers, Scalar, Velocities
-from ._beam_functions import elastic_energy, energy_of_line_loads, numbers_of_bodies
+from ._beam_functions import numbers_of_bodies
 from ._laws import AbstractForceLaw, Acting, Driven, Gap
 from ._layout import Layout, Links
 from ._motion_view import Moving
 from ._parameters import Parameters
 from ._pose_view import evaluate, evaluate_slip, lift, rows, View
+from ._potential import PotentialOfScene
 from ._user_functions import ask, vector_of
 
 
@@ -32,7 +33,7 @@ def make_system(layout: Layout, over_constrained: bool, row_names: Sequence[str]
     redundant = any(group.kind.num_redundant for group in layout.body_groups)
     return System(
         eqx.Partial(kinetic, layout),
-        eqx.Partial(potential, layout),
+        PotentialOfScene(layout),
         eqx.Partial(constraint, layout) if layout.has_constraints else None,
         kinematics=eqx.Partial(velocity_map, layout) if redundant else None,
         coordinate_constraint=eqx.Partial(redundancy, layout) if redundant else None,
@@ -84,33 +85,6 @@ def kinetic(layout: Layout, v: Velocities, args: Parameters) -> Scalar:
     for group, numbers in groups:
         energies.append(0.5 * jnp.sum(numbers["inertance"] * rows(v, group.v) ** 2))
     return sum(energies[1:], start=energies[0])
-
-
-def potential(layout: Layout, q: Coordinates, args: Parameters) -> Scalar:
-    view = View(layout, q)
-    energy = jnp.zeros((), q.dtype)
-    if layout.has_gravity:
-        energy = energy - _weight(view, args)
-    for group, numbers in zip(layout.force_groups, args.tables["forces"], strict=True):
-        if not isinstance(group.law, AbstractForceLaw):
-            energy = energy + jnp.sum(evaluate(group, view, numbers))
-    if layout.beams:
-        energy = energy + elastic_energy(layout, view, args)
-    if layout.line_loads:
-        energy = energy + energy_of_line_loads(layout, view, args)
-    for name, function in layout.potentials:
-        energy = energy + ask(name, function, view, args)
-    return energy
-
-
-def _weight(view: View, args: Parameters) -> Scalar:
-    """The work of gravity on all bodies, from the origin to their positions."""
-    work = jnp.zeros((), view.q.dtype)
-    for group, numbers in numbers_of_bodies(view.layout, args):
-        origins = jax.vmap(group.kind.origin)(rows(view.q, group.q))
-        forces = numbers["mass"][:, None] * args["gravity"][None, :]
-        work = work + jnp.sum(forces * origins)
-    return work
 
 
 def constraint(layout: Layout, q: Coordinates, args: Parameters) -> Multipliers:

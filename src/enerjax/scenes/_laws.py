@@ -219,7 +219,11 @@ class Elastic(AbstractSpringLaw):
     rest: str
 
     def energy(self, value: Array, numbers: Numbers) -> Scalar:
-        return 0.5 * numbers["stiffness"] * (value - numbers[self.rest]) ** 2
+        return 0.5 * numbers["stiffness"] * self.strain(value, numbers) ** 2
+
+    def strain(self, value: Array, numbers: Numbers) -> Scalar:
+        """The difference of the measure from its value without force."""
+        return value - numbers[self.rest]
 
 
 @dataclass(frozen=True)

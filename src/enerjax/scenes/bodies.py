@@ -147,9 +147,10 @@ class RigidBody(AbstractBody):
     - `angular_velocity`: at the start, in space (angle per time).
 
     The body has twelve coordinates, the mass centre and the body axes as vectors in space.
-    `EnergyPreserving`, `EnergyDecaying` and their compositions move it by rotations, with
-    six unknowns in a step, and `EnergyPreserving` conserves momenta to round-off. Other
-    schemes impose six constraints between its axes; see `rigid_bodies` of `System`.
+    `EnergyPreserving`, `EnergyDecaying`, `EnergyMomentumDecaying` and their compositions
+    move it by rotations, with six unknowns in a step. The first and the third conserve
+    momenta to round-off. Other schemes impose six constraints between its axes; see
+    `rigid_bodies` of `System`.
 
     The body can be flat, so that one of its principal moments is the sum of the other two:
     a plate, or a rod whose inertia about its own axis is small. Schemes that impose

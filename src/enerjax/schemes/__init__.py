@@ -26,6 +26,7 @@ from .base import (
 from .composed import Composed as Composed
 from .energy_consistent import EnergyConsistent as EnergyConsistent
 from .energy_decaying import EnergyDecaying as EnergyDecaying
+from .energy_momentum_decaying import EnergyMomentumDecaying as EnergyMomentumDecaying
 from .energy_preserving import EnergyPreserving as EnergyPreserving
 from .generalized_alpha import GeneralizedAlpha as GeneralizedAlpha
 from .kappa_decaying import KappaDecaying as KappaDecaying

@@ -50,10 +50,12 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
     - Conserves: energy, to round-off, at `alpha = 0`.
     - Dissipates: `alpha/2 j . P j >= 0` in every step, also where `V` is not convex. On a
       linear oscillator `rho_inf = (1 - alpha) / (1 + alpha)`. Modes without positive
-      stiffness are not damped. (For a system with more than 64 coordinates whose potential
-      is linear or consists of `Elements`, `K+` is the sum of the positive parts of its
-      elements and constraints. For all others the eigenvalues of the whole matrix are
-      computed, at a cost that grows with the cube of its size.)
+      stiffness are not damped. Rotations of stiff parts are damped like vibrations, unless
+      the angle of a step times `h w` is small; `EnergyMomentumDecaying` does not damp them.
+      (For a system with more than 64 coordinates whose potential is linear or consists of
+      `Elements`, `K+` is the sum of the positive parts of its elements and constraints. For
+      all others the eigenvalues of the whole matrix are computed, at a cost that grows with
+      the cube of its size.)
     - Constraints held at: position and velocity level.
     - Order: 4 at `alpha = 0`, where the scheme is symmetric and `Composed` raises the order
       to 6 or 8; else 3. The order is 2 with forces, which enter as in `EnergyPreserving`,

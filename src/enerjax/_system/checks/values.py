@@ -123,7 +123,7 @@ def check_without_rotations(
             f"`{scheme}` takes the axes of rigid bodies as coordinates, and a body of this "
             "system is flat: it has no inertia along one of its axes. Give it a thickness, "
             "or use a scheme that moves bodies by rotations: `EnergyPreserving`, "
-            "`EnergyDecaying`, or `Composed` of the first."
+            "`EnergyDecaying`, `EnergyMomentumDecaying`, or `Composed` of the first."
         )
 
 

@@ -1,0 +1,94 @@
+"""The potential energy of a scene, and its strains."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from .._system import AbstractStrainEnergy
+from .._types import Coordinates, Scalar
+from ._beam_functions import (
+    elastic_energy,
+    energy_of_line_loads,
+    numbers_of_bodies,
+    strains,
+    stresses,
+)
+from ._frames import Numbers
+from ._laws import AbstractForceLaw, Elastic
+from ._layout import Layout, Links
+from ._parameters import Parameters
+from ._pose_view import evaluate, rows, View
+from ._user_functions import ask
+
+
+class PotentialOfScene(AbstractStrainEnergy):
+    """The potential of a scene, whose `args` are `Parameters`.
+
+    Its strains are those of linear springs, followed by those of beams.
+    """
+
+    layout: Layout = eqx.field(static=True)
+
+    def __call__(self, q, args=None):
+        return _energy(self.layout, q, args)
+
+    def strains(self, q, args=None):
+        view = View(self.layout, q)
+        of_springs = []
+        for group, law, numbers in _springs(self.layout, args):
+            measured = evaluate(group._replace(law=law.measure), view, numbers)
+            of_springs.append(jax.vmap(law.strain)(measured, numbers))
+        groups = zip(self.layout.beam_groups, args.tables["beams"], strict=True)
+        of_beams = [strains(beams, view, numbers) for beams, numbers in groups]
+        return (*of_springs, *of_beams)
+
+    def stresses(self, strains, args=None):
+        tables = [numbers for _, _, numbers in _springs(self.layout, args)]
+        count = len(tables)
+        of_springs = [
+            numbers["stiffness"] * own
+            for numbers, own in zip(tables, strains[:count], strict=True)
+        ]
+        beams = zip(self.layout.beam_groups, args.tables["beams"], strict=True)
+        of_beams = [
+            stresses(group, own, numbers)
+            for (group, numbers), own in zip(beams, strains[count:], strict=True)
+        ]
+        return (*of_springs, *of_beams)
+
+
+def _springs(layout: Layout, args: Parameters) -> list[tuple[Links, Elastic, Numbers]]:
+    """All groups of linear springs, with their laws and numbers."""
+    groups = zip(layout.force_groups, args.tables["forces"], strict=True)
+    return [
+        (group, group.law, numbers)
+        for group, numbers in groups
+        if isinstance(group.law, Elastic)
+    ]
+
+
+def _energy(layout: Layout, q: Coordinates, args: Parameters) -> Scalar:
+    view = View(layout, q)
+    energy = jnp.zeros((), q.dtype)
+    if layout.has_gravity:
+        energy = energy - _weight(view, args)
+    for group, numbers in zip(layout.force_groups, args.tables["forces"], strict=True):
+        if not isinstance(group.law, AbstractForceLaw):
+            energy = energy + jnp.sum(evaluate(group, view, numbers))
+    if layout.beams:
+        energy = energy + elastic_energy(layout, view, args)
+    if layout.line_loads:
+        energy = energy + energy_of_line_loads(layout, view, args)
+    for name, function in layout.potentials:
+        energy = energy + ask(name, function, view, args)
+    return energy
+
+
+def _weight(view: View, args: Parameters) -> Scalar:
+    """The work of gravity on all bodies, from the origin to their positions."""
+    work = jnp.zeros((), view.q.dtype)
+    for group, numbers in numbers_of_bodies(view.layout, args):
+        origins = jax.vmap(group.kind.origin)(rows(view.q, group.q))
+        forces = numbers["mass"][:, None] * args["gravity"][None, :]
+        work = work + jnp.sum(forces * origins)
+    return work
