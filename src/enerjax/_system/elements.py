@@ -25,7 +25,7 @@ class _OfStrains(eqx.Module):
         return 0.5 * jnp.sum(strains * self.stresses(strains, k, args))
 
     def strains(self, x: Float[Array, " width"], k: Any, args: Args) -> Float[Array, " m"]:
-        strains = jnp.asarray(self.strain(x, k, args))
+        strains = jnp.asarray(self.strain(x, k, args), x.dtype)
         if strains.ndim > 1:
             raise ValueError(
                 "`Elements.from_strains(strain, stiffness, table)`: `strain` must return a "
@@ -40,8 +40,8 @@ class _OfStrains(eqx.Module):
         count = strains.size
         if stiffness.shape not in ((), (count,), (count, count)):
             raise ValueError(
-                "`Elements.from_strains(strain, stiffness, table)`: an element has "
-                f"{count} strains, so `stiffness` must return a number, a vector "
+                "`Elements.from_strains(strain, stiffness, table)`: the number of strains "
+                f"of an element is {count}, so `stiffness` must return a number, a vector "
                 f"{(count,)} or a matrix {(count, count)}; got shape {stiffness.shape}."
             )
         if stiffness.ndim < 2:
@@ -111,9 +111,13 @@ class Elements(AbstractStrainEnergy):
           `(width,)`: one strain, or several, shape `(m,)`.
         - `stiffness`: `stiffness(k, args)`, which must not be negative: a number, one for
           each strain, shape `(m,)`, or a symmetric matrix, shape `(m, m)` (energy per
-          strain squared).
+          strain squared). Of a matrix only the symmetric part counts.
         - `table`: the indices of the coordinates of each element, shape `(elements,
           width)`.
+
+        Where strains are functions of distances and of dot products of differences of
+        points or of directors, `EnergyMomentumDecaying` conserves angular momentum to
+        round-off; with cross products, such as areas, to second order.
 
         **Returns:** `Elements` whose values are these energies.
 

@@ -21,7 +21,8 @@ class Composed(AbstractScheme):
 
     **Arguments:**
 
-    - `scheme`: `EnergyPreserving()` or `EnergyConsistent(0.0)`; for comparison `Rattle()`.
+    - `scheme`: `EnergyPreserving()`, `EnergyConsistent(0.0)` or
+      `EnergyMomentumDecaying(0.0)`; for comparison `Rattle()`.
     - `order`: 4, 6 or 8.
 
     Raises a `ValueError` for a scheme that is not symmetric, whose backward stages would
@@ -44,8 +45,9 @@ class Composed(AbstractScheme):
         if not isinstance(scheme, AbstractOneSolveScheme) or not scheme.symmetric:
             raise ValueError(
                 f"`Composed({name})`: only symmetric schemes gain order by composition, "
-                "`EnergyPreserving()` and `EnergyConsistent(0.0)`. The others dissipate, "
-                "and a backward stage would feed that energy in again."
+                "`EnergyPreserving()`, `EnergyConsistent(0.0)` and "
+                "`EnergyMomentumDecaying(0.0)`. The others dissipate, and a backward stage "
+                "would feed that energy in again."
             )
         if (scheme.order, order) not in _HALVES:
             raise ValueError(

@@ -70,14 +70,16 @@ class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
 
     - Conserves: linear and angular momentum, to round-off, for any step length, where
       forces, constraints and the rest of the potential permit it; energy at `alpha = 0`.
-      Strains must be functions of distances, directors and their products. The angular
+      Strains must be functions of distances and of dot products, also of directors; with
+      cross products, such as areas, it is conserved to second order. The angular
       momentum of bodies with an angle, in the plane, is conserved to second order.
     - Dissipates: `alpha/2 (g . K g + s . G s)`, which is never negative where `K` is
       positive semidefinite. On a linear oscillator `rho_inf = (1 - alpha) / (1 + alpha)`.
       Only strains are damped: not the rest of the potential, such as gravity, `Potential`s
-      of a scene and contacts, and not the vibrations of constraints.
+      and nonlinear springs of a scene and contacts, and not the vibrations of constraints.
     - Constraints held at: position and velocity level.
-    - Order: 2. Symmetric at `alpha = 0`. Forces enter as in `EnergyPreserving`.
+    - Order: 2. Symmetric at `alpha = 0`, where it conserves what `EnergyPreserving` does,
+      by other equations: `Composed` raises its order. Forces enter as in that scheme.
     - Rigid bodies in space (`rigid_bodies` of a `System`) are moved by rotations.
     - Requires a potential with strains: that of a scene with springs or beams, or
       `Elements.from_strains`; constant inertia, and no `kinematics`.
@@ -136,8 +138,10 @@ class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
         if strains.count == 0:
             raise ValueError(
                 "`EnergyMomentumDecaying` damps strains, and this system has none: its "
-                "potential does not tell any. Springs and beams of a scene do; for a "
-                "potential of your own use `Elements.from_strains`. Without strains "
+                "potential does not tell any. Those of a scene are told by `Spring`, "
+                "`TorsionSpring` and beams. Otherwise `potential` itself must be the value "
+                "of `Elements.from_strains`, or a sum of such `Elements`, and not a "
+                "function that calls it. Without strains "
                 "`EnergyPreserving` conserves the same momenta, and `EnergyConsistent` "
                 "damps any potential."
             )
