@@ -48,9 +48,9 @@ FAULTS = (
     Fault(
         "root: derivative at the guess",
         "_solvers/root.py",
-        "    _, rate = jax.jvp(by_args, (moved,), (t_args,))\n    linear_solver",
+        "    _, rate = jax.jvp(by_args, (moved,), (t_args,))\n    regularisation",
         "    _, rate = jax.jvp(by_args, (moved,), (t_args,))\n"
-        "    flat = ravel_pytree(start.guess)[0]\n    linear_solver",
+        "    flat = ravel_pytree(start.guess)[0]\n    regularisation",
         "Derivatives of a root solve with the Jacobian at the first guess.",
         of(
             "gradients::test_derivatives_of_a_free_oscillator",

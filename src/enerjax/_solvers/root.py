@@ -17,10 +17,18 @@ from jaxtyping import Array, Float, PyTree
 
 from .._programs import in_one_function, is_known
 from .._types import Flag, Scalar
-from .linear.dense import AbstractFactors, SMALL
-from .linear.jacobian import Linearisable, linearisable
-from .newton import Newton, Start
-from .root_finding import Chord, flat_of, flattened, Root, RootFinder, search
+from .linear.dense import AbstractFactors
+from .linear.jacobian import Linearisable
+from .newton import Start
+from .root_finding import (
+    Chord,
+    flat_of,
+    flattened,
+    Root,
+    RootFinder,
+    search,
+    with_jacobian,
+)
 
 
 # The name by which policies of `jax.checkpoint` refer to the value of a root.
@@ -51,17 +59,8 @@ def _root_jvp(primals, tangents):
     flat, unravel, flat_fn = flattened(fn, root.value)
     by_args = lambda moved: flat_fn(flat, eqx.combine(moved, fixed))
     _, rate = jax.jvp(by_args, (moved,), (t_args,))
-    linear_solver = root_finder.linear_solver if isinstance(root_finder, Newton) else None
     regularisation = flat_of(args[-1])
-    linear = linearisable(
-        flat_fn,
-        flat,
-        args,
-        linear_solver,
-        regularisation,
-        rarely=start.rarely,
-        small=SMALL if chord is None else 0,
-    )
+    linear = with_jacobian(flat_fn, flat, args, root_finder, regularisation, start, chord)
     change = linear.solve(flat, -rate)
     if regularisation is not None:
         change = change + _null_space_rate(linear, flat_fn, flat, (moved, fixed), t_args)

@@ -70,6 +70,30 @@ def flat_of(regularisation: PyTree[Array] | None) -> Array | None:
     return None if regularisation is None else ravel_pytree(regularisation)[0]
 
 
+def with_jacobian(
+    fn: Callable[[Array, Any], Array],
+    like: Float[Array, " n"],
+    args: Any,
+    root_finder: RootFinder,
+    regularisation: Float[Array, " n"] | None,
+    start: Start,
+    chord: Chord | None,
+) -> Linearisable:
+    """The equations with their exact Jacobian, for a search and for derivatives of a root.
+
+    With a chord even small Jacobians are searched for structure.
+    """
+    return linearisable(
+        fn,
+        like,
+        args,
+        root_finder.linear_solver if isinstance(root_finder, Newton) else None,
+        regularisation,
+        rarely=start.rarely,
+        small=SMALL if chord is None else 0,
+    )
+
+
 def search(
     fn: Callable[[PyTree[Array], Any], PyTree[Array]],
     chord: Chord | None,
@@ -101,17 +125,9 @@ def search(
             by_chord=jnp.array(False),
         )
     flat, _, flat_fn = flattened(fn, start.guess)
-    linear_solver, regularisation = root_finder.linear_solver, flat_of(start.regularisation)
-    exact = linearisable(
-        flat_fn,
-        flat,
-        args,
-        linear_solver,
-        regularisation,
-        rarely=start.rarely,
-        small=SMALL if chord is None else 0,
-    )
-    if chord is None or linear_solver is not None:
+    regularisation = flat_of(start.regularisation)
+    exact = with_jacobian(flat_fn, flat, args, root_finder, regularisation, start, chord)
+    if chord is None or root_finder.linear_solver is not None:
         return _iterated(exact, root_finder, start, max_iterations)
     # Separate from the Newton search, which may not be compilable into one function.
     by_chord = lambda: _by_chord(fn, chord, root_finder, args, start)

@@ -16,13 +16,13 @@ from .base import AbstractSchemeWithRotations, Formulation, StepEnd, StepProblem
 class _Unknowns(eqx.Module):
     """The unknowns of a step.
 
-    - `strain`: the impulses `s`, scaled.
+    - `strain_impulse`: the impulses `s`, scaled.
     - `jump`: its `velocity_impulse` is the reaction `kappa` of the joints to the impulses
       `s` at the start; its other fields are empty.
     - `end`: the increment to the end of the step.
     """
 
-    strain: Float[Array, " ns"]
+    strain_impulse: Float[Array, " ns"]
     jump: Increment
     end: Increment
 
@@ -172,7 +172,7 @@ class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
         of_strains = jumps.impulse - h / 6 * strains.stresses(moved)
         held = model.joint_change(start.q, jumps.velocity, start.t)
         return _Unknowns(
-            strain=of_strains / problem.row_scale,
+            strain_impulse=of_strains / problem.row_scale,
             jump=eqx.tree_at(lambda jump: jump.velocity_impulse, z.jump, held),
             end=step.rows(z.end, end, gradient.plus(*terms)),
         )
@@ -186,7 +186,7 @@ class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
         # Without stiffness the rows of the strains determine their impulses, and these move
         # the velocities at the end of the step and the joints.
         start = problem.step.start
-        impulse = problem.row_scale * rows.strain
+        impulse = problem.row_scale * rows.strain_impulse
         momentum = problem.strains.momentum(start.q, impulse)
         moved = delassus.product(delassus.inverse_inertia @ momentum)
         right = moved - rows.jump.velocity_impulse
@@ -197,7 +197,7 @@ class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
             (rows.end.rate + momentum, rows.end.velocity_impulse + moved),
         )
         return _Unknowns(
-            strain=impulse / problem.scale,
+            strain_impulse=impulse / problem.scale,
             jump=eqx.tree_at(
                 lambda jump: jump.velocity_impulse,
                 rows.jump,
@@ -225,7 +225,7 @@ class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
         step, strains = problem.step, problem.strains
         model, start, h = step.separable_model, step.start, step.h
         q1, t1 = step.position(z.end), step.end_time
-        impulse = problem.scale * z.strain
+        impulse = problem.scale * z.strain_impulse
         by_strains = model.inverse_inertia @ strains.mean_momentum(
             start.q, q1, h * z.end.rate, 0.5 * impulse
         )

@@ -75,8 +75,8 @@ class Band:
 
     def is_cheaper_than_dense(self) -> bool:
         """Whether the block elimination needs less work than that of the dense matrix."""
-        # The time of a multiplication, in those of a dense elimination: by LAPACK, or of a
-        # small matrix in plain operations.
+        # A multiplication takes so many times as long as one of the dense elimination. That
+        # is by LAPACK, or for a small matrix in plain operations.
         cost = 40 if self.width < LAPACK_FROM else 8
         cost = cost if self.size > SMALL else 10
         return cost * self.num_blocks * self.width**3 < self.size**3
