@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._operators import make_model
-from .._programs import compiled, is_known
+from .._programs import compiled, compiled_for_once, is_known
 from .._system import AbstractSystem, check_system, State, System
 from .._types import (
     Args,
@@ -178,7 +178,7 @@ def _start(
     )
 
 
-@compiled
+@compiled_for_once
 def _is_consistent(system: AbstractSystem, state: State, args: Args) -> Flag:
     """Whether each constraint and its rate vanish to round-off."""
     model = make_model(system, state, args)

@@ -5,6 +5,7 @@ from .batching import in_any_lane as in_any_lane
 from .compiled import (
     at_top_level as at_top_level,
     compiled as compiled,
+    compiled_for_once as compiled_for_once,
     once_per_structure as once_per_structure,
     Readable as Readable,
 )

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jax.extend import source_info_util
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
@@ -30,7 +30,7 @@ def interpret(
 
     def read(atom: Any) -> Any:
         if isinstance(atom, Literal):
-            return jnp.asarray(atom.val, atom.aval.dtype)  # pyright: ignore
+            return np.asarray(atom.val, atom.aval.dtype)  # pyright: ignore
         return known[atom]
 
     for eqn in jaxpr.eqns:

@@ -9,7 +9,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .._discrete import AbstractCorrected, AbstractDerivative, ChainRule
-from .._programs import compiled, is_known
+from .._programs import compiled_for_once, is_known
 from .._system import (
     AbstractSystem,
     describe,
@@ -89,7 +89,7 @@ def _functions(
     return found
 
 
-@compiled
+@compiled_for_once
 def _facts(
     derivative: AbstractDerivative, system: AbstractSystem, state: State, args: Args
 ) -> list[tuple[Flag, Flag]]:

@@ -5,10 +5,10 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
-from .._programs import is_known
+from .._programs import compiled_for_once, is_known
 from .._types import Real, Vector
 from ._arguments import module_of, velocities
 from ._beam_geometry import along_curve, places_of, Sections, straight, weights_of
@@ -195,11 +195,16 @@ def _strains(law: AbstractStrains, sections: Sections) -> Any:
     """The strains of all elements in the reference."""
     frames = Frame(sections.origins, sections.axes, sections.angles)
     a, b = (
-        jax.tree.map(lambda x, part=part: jnp.asarray(x)[part], frames)
+        jax.tree.map(lambda x, part=part: x[part], frames)
         for part in (slice(None, -1), slice(1, None))
     )
-    strains = jax.vmap(law)(a, b, dict(length=jnp.asarray(sections.lengths)))
+    strains = _strains_of(law, a, b, sections.lengths)
     return np.asarray(strains) if is_known(strains) else strains
+
+
+@compiled_for_once
+def _strains_of(law: AbstractStrains, a: Frame, b: Frame, lengths: Array) -> Array:
+    return jax.vmap(law)(a, b, dict(length=lengths))
 
 
 def _coordinates(sections: Sections) -> Any:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._programs import compiled
+from .._programs import compiled_for_once
 from .._types import Coordinates, Scalar
 from ._frames import Frame, Numbers
 from ._functions import drives_at, inerters_at
@@ -43,7 +43,7 @@ class Measured(NamedTuple):
 Columns: TypeAlias = tuple[Array, Array, Array, Array]
 
 
-@compiled
+@compiled_for_once
 def measured(
     layout: Layout, q: Coordinates, qdot: Coordinates, t: Scalar, args: Parameters
 ) -> list[Columns]:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._programs import compiled, is_known
+from .._programs import compiled_for_once, is_known
 from .._types import Coordinates, Velocities
 from ._arguments import module_of, number
 from ._beam_geometry import weights_of
@@ -250,7 +250,7 @@ class _StartPose:
         )
 
 
-@compiled
+@compiled_for_once
 def _all_frames(layout: Layout, q: Coordinates) -> Frame:
     view = View(layout, q)
     return Frame(view.origins, view.axes, view.angles)
@@ -269,7 +269,7 @@ def start_of(
     return jnp.concatenate([q, values]), jnp.concatenate([v, rates])
 
 
-@compiled
+@compiled_for_once
 def _of_inerters(
     layout: Layout, q: Coordinates, v: Velocities, args: Parameters
 ) -> tuple[Array, Array]:

@@ -21,6 +21,7 @@ from jax.extend.core.primitives import reduce_sum_p
 from jaxtyping import Array, Int
 
 from ..jaxprs import evaluate, interpret, programs_within, wrapped_program
+from ..numpy_primitives import evaluated
 from ..primitives import CONTRACTION, SCATTERS
 from .possible import is_small_product, LARGEST_SUM, NAME
 from .products import written_out
@@ -55,7 +56,7 @@ def _equation(eqn: Any, values: list[Any]) -> list[Any]:
     is_index = all(not jnp.issubdtype(x.aval.dtype, jnp.inexact) for x in eqn.outvars)
     if is_index and all(isinstance(x, np.ndarray) for x in values):
         with jax.ensure_compile_time_eval():
-            return [np.asarray(x) for x in evaluate(eqn.primitive, values, params)]
+            return list(map(np.asarray, evaluated(eqn.primitive, values, params)))
     if _must_be_replaced(eqn):
         if name == CONTRACTION and eqn.outvars[0].aval.size <= LARGEST_SUM:
             left, right = values

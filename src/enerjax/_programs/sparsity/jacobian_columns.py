@@ -20,10 +20,10 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array, Float
 
 from ..jaxprs import evaluate, interpret
+from ..numpy_primitives import MOVES
 from ..one_function.api import unmerged
 from ..one_function.possible import LARGEST_SUM
 from ..primitives import ARITHMETIC, JIT
-from .data_movement import MOVES
 
 
 # Tables of nonzero entries with more truth values than this are not computed.

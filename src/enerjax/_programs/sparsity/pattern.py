@@ -20,6 +20,7 @@ import scipy
 from jaxtyping import Array
 
 from ..jaxprs import evaluate, interpret, is_known, name_of, wrapped_program
+from ..numpy_primitives import evaluated, moved
 from ..primitives import (
     CONTRACTION,
     CONTROL_FLOW,
@@ -29,7 +30,6 @@ from ..primitives import (
     PIECEWISE_CONSTANT,
     REDUCTIONS,
 )
-from .data_movement import MOVES
 
 
 # Systems with more unknowns than this are searched for structure.
@@ -106,7 +106,7 @@ def _equation(equation: Any, values: list[_Value], of_values: bool) -> list[_Val
     if not any(isinstance(v, _Depends) for v in values):
         if any(isinstance(v, _Constant) for v in values) or primitive.name in CONTROL_FLOW:
             return list(map(_Constant, avals))
-        return evaluate(primitive, values, params)
+        return evaluated(primitive, values, params)
     # Truth values and indices have no derivative.
     smooth = any(jnp.issubdtype(aval.dtype, jnp.inexact) for aval in avals)
     if not of_values and (not smooth or primitive.name in _ZERO):
@@ -186,8 +186,7 @@ def _moved(primitive: Any, values: list[_Value], params: Any, avals: Any) -> lis
         operands[k] = numbers
     blank = scipy.sparse.csr_array((1, _width(values)), dtype=bool)
     table = scipy.sparse.csr_array(scipy.sparse.vstack([blank, *rows]))
-    move = MOVES.get(primitive.name)
-    outs = move(*operands, **params) if move else evaluate(primitive, operands, params)
+    outs = moved(primitive, operands, params)
     return [table[np.nan_to_num(np.asarray(out)).astype(int).ravel()] for out in outs]
 
 

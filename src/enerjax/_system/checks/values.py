@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..._programs import compiled, is_known
+from ..._programs import compiled_for_once, is_known
 from ..._solvers import is_positive_definite, scaled_blocks, Symmetric
 from ..._types import Args, Flag
 from ..base import AbstractSystem, State
@@ -19,7 +19,7 @@ def direction_without_symmetry(x: Float[Array, " n"]) -> Float[Array, " n"]:
     return 1 + 0.5 * jnp.cos(jnp.arange(x.size, dtype=x.dtype))
 
 
-@compiled
+@compiled_for_once
 def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]:
     inertia = system.inertia(state, args)
     blocks, eps = scaled_blocks(inertia), 1e3 * jnp.finfo(inertia.dtype).eps
