@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 
 import enerjax as ej
-from enerjax._programs import jacobian_pattern, primitives, shape_of
+from enerjax._programs import (
+    evaluate,
+    interpret,
+    jacobian_pattern,
+    num_operations,
+    primitives,
+    shape_of,
+    simplified,
+)
+from enerjax._programs.numpy_primitives import evaluated
 
 
 BASIC = [
@@ -61,3 +70,60 @@ def test_moved_entries_keep_the_pattern_sparse(name):
     assert pattern is not None
     assert shape_of(pattern) == (fn(x).size, x.size)
     np.testing.assert_array_equal(pattern.toarray(), jax.jacobian(fn)(x) != 0)
+
+
+ROWS = np.array([2, 0, 1])
+# Programs with indices, which are evaluated with NumPy while others are traced.
+WITH_INDICES = {
+    "rows": lambda x: x[ROWS],
+    "columns": lambda x: x[:, ROWS + 1],
+    "entries": lambda x: x[ROWS, ROWS[::-1]],
+    "blocks": lambda x: x[ROWS[:, None], ROWS[None]],
+    "parts of rows": lambda x: x[ROWS][:, 1:3],
+    "batch": lambda x: jnp.take_along_axis(x, ROWS[:, None], axis=1),
+    "batch of vectors": lambda x: jax.vmap(lambda row, k: row[k])(x, ROWS),
+    "slice": lambda x: jax.lax.dynamic_slice(x, (1, 9), (2, 3)),
+    "outside": lambda x: x.at[ROWS + 2].get(mode="fill", fill_value=-1),
+    "triangle": lambda x: jnp.where(jnp.tri(3, 4, dtype=bool), x, -x),
+    "stack": lambda x: jnp.stack([x, x + 1], axis=1),
+    "unstack": lambda x: jnp.concatenate(jnp.unstack(x, axis=1)[::-1]),
+    "numbers": lambda x: jnp.arange(3)[:, None] * x - jnp.maximum(x, 4),
+}
+
+
+@pytest.mark.parametrize("name", WITH_INDICES)
+def test_indices_are_those_of_jax(name):
+    x = np.arange(12).reshape(3, 4)
+    program = jax.make_jaxpr(WITH_INDICES[name])(x)
+
+    def equation(eqn, values):
+        inner = eqn.params.get("jaxpr")
+        if inner is not None:
+            return interpret(inner.jaxpr, inner.consts, values, equation)
+        found = evaluated(eqn.primitive, values, eqn.params)
+        exact = evaluate(eqn.primitive, list(map(jnp.asarray, values)), eqn.params)
+        for one, other in zip(found, exact, strict=True):
+            np.testing.assert_array_equal(one, other)
+            assert one.dtype == other.dtype
+        return found
+
+    interpret(program.jaxpr, program.consts, [x], equation)
+
+
+def test_a_simplified_program_has_each_operation_once():
+    def repeating(x):
+        unused = jnp.exp(x)
+        a, b, _ = jnp.sum(jnp.sin(x) ** 2), jnp.sum(jnp.sin(x) ** 2), jnp.sum(unused)
+        return dict(sum=a + b, product=a * b)
+
+    def once(x):
+        a = jnp.sum(jnp.sin(x) ** 2)
+        return dict(sum=a + a, product=a * a)
+
+    x = jnp.linspace(0.1, 0.9, 4)
+    lean = simplified(repeating)
+    assert num_operations(lean, x) == num_operations(once, x)
+    assert num_operations(lean, x) < num_operations(repeating, x)
+    assert lean(x) == repeating(x)
+    slope = lambda fn: jax.grad(lambda x: fn(x)["product"])(x)
+    np.testing.assert_array_equal(slope(lean), slope(repeating))

@@ -15,7 +15,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from .._programs import in_one_function, is_known
+from .._programs import in_one_function, is_known, simplified
 from .._types import Flag, Scalar
 from .linear.dense import AbstractFactors
 from .linear.jacobian import Linearisable
@@ -162,9 +162,8 @@ def find_root(
 def _explicit_closure(fn: Callable, *like: Any) -> tuple[Any, Callable]:
     """The traced values in the closure of `fn`, and `fn` with these as first argument."""
     # Functions in `args` may contain traced numbers. (`filter_closure_convert` skips
-    # functions without a closure, so `fn` is wrapped in a lambda, which has one.)
-    closed = lambda *args: fn(*args)
-    converted = eqx.filter_closure_convert(closed, *like)
+    # functions without a closure; `simplified(fn)` has one.)
+    converted = eqx.filter_closure_convert(simplified(fn), *like)
     # Known values stay in the closure: the sparsity pattern is found from known indices.
     traced, known = eqx.partition(converted, lambda x: not is_known(x))
     return traced, lambda traced, *args: eqx.combine(traced, known)(*args)

@@ -71,11 +71,11 @@ class View:
         """A field of the ground and of all bodies, or of `only` these, in their order."""
         dimension, dtype = self.layout.dimension, self.q.dtype
         of_ground = {
-            "origin": jnp.zeros((1, dimension), dtype),
-            "axes": jnp.eye(dimension, dtype=dtype)[None],
-            "angle": jnp.zeros((1,), dtype),
+            "origin": np.zeros((1, dimension)),
+            "axes": np.eye(dimension)[None],
+            "angle": np.zeros((1,)),
         }
-        parts, first = [of_ground[field]], 1
+        parts, first = [of_ground[field].astype(dtype)], 1
         for group in self.layout.body_groups:
             count = len(group.names)
             chosen = np.arange(count) if only is None else only - first

@@ -26,10 +26,9 @@ from ..primitives import (
 # XLA calls a library for sums of more entries; this limit leaves a margin.
 LARGEST_SUM = 2048
 # The largest number of array operations of one function. The time of its compilation grows
-# faster than its length. As one function a rigid body by `EnergyDecaying` (21 000
-# operations) would compile in 29 s instead of 16 s, and an arm of six angles by
-# `EnergyConsistent` (15 000) in 67 s instead of 17 s. Their steps would take half the time.
-LARGEST_PROGRAM = 13_000
+# faster than its length: as one function two hinged bodies in space (9000 operations) would
+# compile in 36 s instead of 18 s, and their steps would take 15 us instead of 18 us.
+LARGEST_PROGRAM = 8_700
 # XLA calls a library for products of matrices with as many rows and columns.
 _FEW = 8
 
