@@ -5,14 +5,14 @@ translated as often as their program occurs in another one. Half of the operatio
 residual are of this kind.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.interpreters.partial_eval import dce_jaxpr_consts
+from jax.extend.core import Literal
 from jaxtyping import Array, PyTree
 
 from .jaxprs import evaluate, interpret
@@ -26,25 +26,38 @@ def simplified(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Array]]
         leaves, structure = jax.tree.flatten(numbers)
         whole = lambda *leaves: fn(*eqx.combine(structure.unflatten(leaves), rest))
         closed, like = jax.make_jaxpr(whole, return_shape=True)(*leaves)
-        jaxpr, of_consts, of_inputs = dce_jaxpr_consts(
-            closed.jaxpr, [True] * len(closed.out_avals)
-        )
-        consts = [x for x, used in zip(closed.consts, of_consts, strict=True) if used]
-        inputs = [x for x, used in zip(leaves, of_inputs, strict=True) if used]
-        out = interpret(jaxpr, consts, inputs, _Once())
+        rule = _Once(_needed(closed.jaxpr))
+        out = interpret(closed.jaxpr, closed.consts, leaves, rule)
         return jax.tree.unflatten(jax.tree.structure(like), map(jnp.asarray, out))
 
     return call
 
 
-class _Once:
-    """Evaluates an equation, unless an equal one has been evaluated before."""
+def _needed(jaxpr: Any) -> set[int]:
+    """The identities of the equations on which the outputs depend."""
+    used, needed = set(_variables(jaxpr.outvars)), set()
+    for eqn in reversed(jaxpr.eqns):
+        if eqn.effects or not used.isdisjoint(eqn.outvars):
+            needed.add(id(eqn))
+            used.update(_variables(eqn.invars))
+    return needed
 
-    def __init__(self):
+
+def _variables(atoms: Iterable[Any]) -> Iterator[Any]:
+    return (x for x in atoms if not isinstance(x, Literal))
+
+
+class _Once:
+    """Evaluates an equation that is needed, unless it has evaluated an equal one."""
+
+    def __init__(self, needed: set[int]):
+        self._needed = needed
         # The values are kept, because the identity of one that is gone can be used again.
         self._found: dict[Any, tuple[list[Any], list[Any]]] = {}
 
     def __call__(self, equation: Any, values: list[Any]) -> list[Any]:
+        if id(equation) not in self._needed:
+            return [None] * len(equation.outvars)
         primitive, params = equation.primitive, equation.params
         key = primitive, tuple(params.items()), tuple(map(_identity, values))
         if equation.effects or not _is_hashable(key):
