@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from .._operators import AbstractModel, Increment, SeparableModel
-from .._programs import num_operations, why_not_one_function
+from .._programs import num_operations, simplified, why_not_one_function
 from .._run.inputs import prepare
 from .._run.loop import Stepper
 from .._run.stage import free_flight, step_problem
@@ -134,7 +134,9 @@ def _explained(
         chord=_chord(model) if by_chord else None,
         jacobian=jacobian,
         obstacles=why_not_one_function(step, begin),
-        operations=num_operations(lambda x: equations(x, (scheme.stage, problem)), flat),
+        operations=num_operations(
+            simplified(lambda x: equations(x, (scheme.stage, problem))), flat
+        ),
     )
 
 
