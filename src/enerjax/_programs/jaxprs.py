@@ -34,8 +34,10 @@ def interpret(
         return known[atom]
 
     for eqn in jaxpr.eqns:
-        # The new equation comes from the same line as the one that it stands for.
-        with source_info_util.user_context(eqn.source_info.traceback):
+        # The new equation comes from the same line as the one that it stands for. Literals
+        # are NumPy arrays; as with JAX, what is undefined is NaN, without a warning.
+        source = source_info_util.user_context(eqn.source_info.traceback)
+        with source, np.errstate(all="ignore"):
             outs = equation(eqn, list(map(read, eqn.invars)))
         known.update(zip(eqn.outvars, outs, strict=True))
     return list(map(read, jaxpr.outvars))
