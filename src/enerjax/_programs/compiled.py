@@ -100,7 +100,7 @@ def once_per_structure(check: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(check)
     def call(*args: Any) -> None:
         static, arrays = _parts(args)
-        if not at_top_level(args) or not _is_hashable(static):
+        if not at_top_level(args) or not is_hashable(static):
             return check(*args)
         types = (jax.ShapeDtypeStruct(np.shape(x), x.dtype) for x in arrays)
         return of_types(static, tuple(types))
@@ -108,7 +108,8 @@ def once_per_structure(check: Callable[..., None]) -> Callable[..., None]:
     return call
 
 
-def _is_hashable(x: Any) -> bool:
+def is_hashable(x: Any) -> bool:
+    """Whether `x` can be a key: whether all of its parts can be hashed."""
     try:
         hash(x)
     except TypeError:

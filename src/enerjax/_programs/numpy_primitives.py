@@ -111,7 +111,7 @@ MOVES: dict[str, Callable] = {
     "unstack": _unstack,
 }
 # The first operand of these is moved, to places that the others tell.
-_MOVES = MOVES | {"dynamic_slice": _dynamic_slice, "gather": _gather}
+_EVERY_MOVE = MOVES | {"dynamic_slice": _dynamic_slice, "gather": _gather}
 
 
 def _iota(*, dtype, shape, dimension, **_):
@@ -143,7 +143,7 @@ _FUNCTIONS: dict[str, Callable] = {
 
 def moved(primitive: Any, values: list[Any], params: dict[str, Any]) -> list[Any]:
     """The outputs of a primitive that moves entries, of arrays that are known."""
-    values, move = list(map(np.asarray, values)), _MOVES.get(primitive.name)
+    values, move = list(map(np.asarray, values)), _EVERY_MOVE.get(primitive.name)
     if move is None or (move is _gather and not _is_inside(*values, **params)):
         return evaluate(primitive, values, params)
     return move(*values, **params)
@@ -152,7 +152,7 @@ def moved(primitive: Any, values: list[Any], params: dict[str, Any]) -> list[Any
 def evaluated(primitive: Any, values: list[Any], params: dict[str, Any]) -> list[Any]:
     """The outputs of any primitive, of arrays that are known."""
     name = primitive.name
-    if name in _MOVES:
+    if name in _EVERY_MOVE:
         return moved(primitive, values, params)
     if name == "iota":
         return _iota(**params)

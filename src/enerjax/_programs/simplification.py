@@ -15,6 +15,7 @@ import numpy as np
 from jax.extend.core import Literal
 from jaxtyping import Array, PyTree
 
+from .compiled import is_hashable
 from .jaxprs import evaluate, interpret
 
 
@@ -60,7 +61,7 @@ class _Once:
             return [None] * len(equation.outvars)
         primitive, params = equation.primitive, equation.params
         key = primitive, tuple(params.items()), tuple(map(_identity, values))
-        if equation.effects or not _is_hashable(key):
+        if equation.effects or not is_hashable(key):
             return evaluate(primitive, values, params)
         if key not in self._found:
             self._found[key] = evaluate(primitive, values, params), values
@@ -72,11 +73,3 @@ def _identity(value: Any) -> Any:
     if isinstance(value, np.ndarray) and value.ndim == 0:
         return value.tobytes(), value.dtype
     return id(value)
-
-
-def _is_hashable(x: Any) -> bool:
-    try:
-        hash(x)
-    except TypeError:
-        return False
-    return True
