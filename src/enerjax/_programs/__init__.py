@@ -8,6 +8,7 @@ from .compiled import (
     compiled_for_once as compiled_for_once,
     once_per_structure as once_per_structure,
     Readable as Readable,
+    structure_of as structure_of,
 )
 from .counting import num_operations as num_operations
 from .digest import checksum as checksum, digest as digest

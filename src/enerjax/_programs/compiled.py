@@ -94,18 +94,26 @@ def once_per_structure(check: Callable[..., None]) -> Callable[..., None]:
     """
 
     @functools.lru_cache(maxsize=128)
-    def of_types(static: _Static, types: tuple[jax.ShapeDtypeStruct, ...]) -> None:
-        check(*_joined(static, types))
+    def of_structure(structure: _Structure) -> None:
+        check(*_joined(*structure))
 
     @functools.wraps(check)
     def call(*args: Any) -> None:
-        static, arrays = _parts(args)
-        if not at_top_level(args) or not is_hashable(static):
-            return check(*args)
-        types = (jax.ShapeDtypeStruct(np.shape(x), x.dtype) for x in arrays)
-        return of_types(static, tuple(types))
+        structure = structure_of(args) if at_top_level(args) else None
+        return check(*args) if structure is None else of_structure(structure)
 
     return call
+
+
+def structure_of(tree: PyTree[Any]) -> "_Structure | None":
+    """What is static in a tree, with the types of its arrays, if that can be hashed.
+
+    Calls of a compiled function with arguments of one structure run one program.
+    """
+    static, arrays = _parts(tree)
+    if not is_hashable(static):
+        return None
+    return static, tuple(jax.ShapeDtypeStruct(np.shape(x), x.dtype) for x in arrays)
 
 
 def is_hashable(x: Any) -> bool:
@@ -118,6 +126,7 @@ def is_hashable(x: Any) -> bool:
 
 
 _Static: TypeAlias = tuple[tuple[tuple[Any, ...], tuple[Any, ...]], Any]
+_Structure: TypeAlias = tuple[_Static, tuple[jax.ShapeDtypeStruct, ...]]
 
 
 def _parts(tree: PyTree[Any]) -> tuple[_Static, list[Array]]:

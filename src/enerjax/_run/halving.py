@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from .._operators import AbstractModel
 from .._programs import in_any_lane
 from .._results import RESULTS
-from .._solvers import RootFinder, SMALL
+from .._solvers import ChordAlone, RootFinder, SMALL
 from .._system import State
 from .._types import Count, Flag, Scalar
 from ..schemes import AbstractOneSolveScheme, AbstractSchemeWithMemory, StepEnd
@@ -40,7 +40,7 @@ class _Step(eqx.Module):
     start: State
     h: Scalar
     memory: Memory
-    root_finder: RootFinder
+    root_finder: RootFinder | ChordAlone
     skip: Flag
 
     def solve(self, rarely: bool = False) -> Solved:
@@ -76,19 +76,21 @@ def solve_or_divide(
     start: State,
     h: Scalar,
     memory: Memory,
-    root_finder: RootFinder,
+    root_finder: RootFinder | ChordAlone,
     skip: Flag,
     max_halvings: int | None,
 ) -> tuple[Solved, Count]:
     """The solved step, and how often it was halved.
 
     By default a step of a large system may be halved three times, and that of a small
-    system not at all.
+    system not at all. Where the chord method is alone, a step that it cannot solve fails.
     """
     step = _Step(scheme, model, start, h, memory, root_finder, skip)
     if max_halvings is None:
         is_large = num_unknowns(memory) > SMALL
         max_halvings = _HALVINGS_OF_LARGE_SYSTEMS if is_large else 0
+    if isinstance(root_finder, ChordAlone) and memory.chord_wait is not None:
+        max_halvings = 0
     if max_halvings == 0:
         return step.solve(), jnp.array(0)
     return _solve_or_divide(step, max_halvings)

@@ -11,7 +11,7 @@ from jaxtyping import Array, PyTree
 from .._operators import AbstractModel
 from .._programs import in_any_lane
 from .._results import first_failure, RESULTS
-from .._solvers import RootFinder
+from .._solvers import ChordAlone, RootFinder
 from .._system import State
 from .._types import Count, Flag, Multipliers, Scalar
 from ..schemes import AbstractScheme, Energies
@@ -48,7 +48,7 @@ class Stepper(eqx.Module):
     scheme: AbstractScheme
     model: AbstractModel
     plan: AbstractPlan
-    root_finder: RootFinder
+    root_finder: RootFinder | ChordAlone
     max_halvings: int | None = eqx.field(static=True)
     watcher: Watcher | None = None
 

@@ -21,6 +21,7 @@ from .solution import first_rows, Solution
 from .step_sizes import AbstractController, EqualSteps, find_end
 from .task import Task
 from .watcher import watcher_of
+from .without_jacobian import chord_alone, needs_jacobian
 
 
 def simulate(
@@ -159,17 +160,22 @@ def simulate(
 
 def _whole(task: Task, num_rows: int) -> tuple[Solution, Scalar]:
     """A run in one piece, and the time that it has reached."""
-    if at_top_level(task) and task.watcher is None:
-        task = dataclasses.replace(task, plan=task.plan.rounded_up())
-    solution, reached = _run(task)
+    quick = None
+    if at_top_level(task):
+        if task.watcher is None:
+            task = dataclasses.replace(task, plan=task.plan.rounded_up())
+        quick = chord_alone(task)
+    solution, reached, by_chord = _run(task if quick is None else quick)
+    if quick is not None and by_chord and needs_jacobian(task, solution.result):
+        solution, reached, _ = _run(task)
     if solution.ts.size > num_rows:
         solution = first_rows(solution, num_rows)
     return solution, reached
 
 
 @compiled
-def _run(task: Task) -> tuple[Solution, Scalar]:
-    """The program of a run in one piece."""
+def _run(task: Task) -> tuple[Solution, Scalar, bool]:
+    """The program of a run in one piece, which also tells whether it has a chord method."""
     plan, saving, stepper = task.plan, task.saving, task.stepper()
     model = stepper.model
     start = model.to_internal(task.start)
@@ -185,4 +191,4 @@ def _run(task: Task) -> tuple[Solution, Scalar]:
     rows = saving.rows(run)
     happened = task.events(model, record, rows.multipliers)
     solution = dataclasses.replace(task.solution(model, rows, end), events=happened)
-    return solution, plan.time(end.place)
+    return solution, plan.time(end.place), end.warm.stages.chord_wait is not None

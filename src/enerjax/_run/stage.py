@@ -6,7 +6,6 @@ guesses are the unknowns of a free flight, which is a step without forces, plus 
 extrapolation of the differences between the last steps and their free flights.
 """
 
-import functools
 from typing import Any
 
 import equinox as eqx
@@ -20,6 +19,7 @@ from .._results import first_failure, from_root_finder, RESULTS
 from .._solvers import (
     AbstractFactors,
     Chord,
+    ChordAlone,
     find_root,
     kept_factors,
     Root,
@@ -117,7 +117,7 @@ def solve(
     start: State,
     h: Scalar,
     memory: Memory,
-    root_finder: RootFinder,
+    root_finder: RootFinder | ChordAlone,
     skip: Flag,
     *,
     rarely: bool = False,
@@ -148,7 +148,7 @@ def solve(
         by_chord=True if wait is None else wait == 0,
         rarely=rarely or wait is not None,
     )
-    return _solved(scheme, problem, model, start, memory, prepared, root)
+    return _solved(scheme, problem, model, start, memory, prepared, root, root_finder)
 
 
 def unsolved(
@@ -217,15 +217,17 @@ def _solved(
     memory: Memory,
     prepared: _Prepared,
     root: Root,
+    root_finder: RootFinder | ChordAlone,
 ) -> Solved:
     """The result of a step whose search has ended with `root`."""
     z = jax.tree.map(jnp.multiply, root.value, prepared.unknown_scale)
     end = scheme.finish(z, problem)
-    reverses = lambda: _gradients_reverse(model, start, end.state)
+    reverses, no = lambda: _gradients_reverse(model, start, end.state), jnp.array(False)
     if memory.chord_wait is not None:
         # Where the chord method converges, the gradients have hardly changed.
-        reverses = functools.partial(
-            jax.lax.cond, root.by_chord, lambda: jnp.array(False), reverses
+        alone, by_newton = isinstance(root_finder, ChordAlone), reverses
+        reverses = lambda: (
+            no if alone else jax.lax.cond(root.by_chord, lambda: no, by_newton)
         )
     branch = RESULTS.where(reverses(), RESULTS.step_too_large, RESULTS.successful)
     found = from_root_finder(root.found, root.broken, root.finite)

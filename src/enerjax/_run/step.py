@@ -10,7 +10,7 @@ from jaxtyping import Array, PyTree
 from .._operators import AbstractModel, local_error, make_model
 from .._programs import compiled, in_one_function
 from .._results import first_of, RESULTS
-from .._solvers import largest, Newton, RootFinder
+from .._solvers import ChordAlone, largest, Newton, RootFinder
 from .._system import AbstractSystem, State
 from .._types import Args, Coordinates, Count, Flag, Multipliers, Real, Scalar, Velocities
 from ..schemes import AbstractScheme, AbstractSchemeWithRotations, Energies
@@ -98,7 +98,7 @@ def advance(
     start: State,
     h: Scalar,
     warm: Warm,
-    root_finder: RootFinder,
+    root_finder: RootFinder | ChordAlone,
     skip: Flag,
     max_halvings: int | None = None,
 ) -> StepOutput:

@@ -168,10 +168,10 @@ class EqualSteps(AbstractController):
     The first failed step ends the run.
     """
 
-    def plan(self, scheme: AbstractScheme, h: Scalar, t0: Scalar, end: End) -> "_EqualPlan":
+    def plan(self, scheme: AbstractScheme, h: Scalar, t0: Scalar, end: End) -> "EqualPlan":
         if end.num_steps is not None:
             number = jnp.asarray(end.num_steps, h.dtype)
-            return _EqualPlan(
+            return EqualPlan(
                 t0=t0,
                 t1=t0 + h * number,
                 unit=h,
@@ -188,7 +188,7 @@ class EqualSteps(AbstractController):
                 "bound, such as the number of steps at the shortest `h`."
             )
         number = jnp.asarray(end.needed, h.dtype)
-        return _EqualPlan(
+        return EqualPlan(
             t0=t0,
             t1=end.t1,
             unit=(end.t1 - t0) / number,
@@ -204,7 +204,9 @@ NEAR = 1e-12
 _LEAST_HOP = 1e-3
 
 
-class _EqualPlan(AbstractPlan):
+class EqualPlan(AbstractPlan):
+    """The steps of `EqualSteps`."""
+
     t0: Scalar
     t1: Scalar
     unit: Scalar
@@ -261,12 +263,12 @@ class _EqualPlan(AbstractPlan):
     def numbers(self) -> PyTree[Any]:
         return self.t0, self.unit
 
-    def with_events(self, attempts: int) -> "_EqualPlan":
+    def with_events(self, attempts: int) -> "EqualPlan":
         more = self.max_attempts + attempts
         changes = dict(max_attempts=more, is_counted=False, may_end_early=True)
         return dataclasses.replace(self, **changes)
 
-    def rounded_up(self) -> "_EqualPlan":
+    def rounded_up(self) -> "EqualPlan":
         if is_known(self.last) and self.last > self.max_attempts:
             # The bound of the user ends this run.
             return self

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from .._operators import AbstractModel
-from .._solvers import RootFinder
+from .._solvers import ChordAlone, RootFinder
 from .._system import AbstractSystem, State
 from .._types import Args, Coordinates, Scalar
 from ..schemes import AbstractScheme
@@ -33,7 +33,7 @@ class Task(eqx.Module):
     plan: AbstractPlan
     saving: AbstractSaving
     fn: SaveFunction | None
-    root_finder: RootFinder
+    root_finder: RootFinder | ChordAlone
     max_halvings: int | None
     watcher: Watcher | None = None
 

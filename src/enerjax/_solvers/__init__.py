@@ -46,7 +46,7 @@ from .linear.user_solver import (
     KLU as KLU,
     SparsePattern as SparsePattern,
 )
-from .newton import Newton as Newton
+from .newton import ChordAlone as ChordAlone, Newton as Newton
 from .newton_iterations import max_norm as max_norm
 from .root import find_root as find_root, ROOT as ROOT
 from .root_finding import (

@@ -17,12 +17,13 @@ from .newton import Newton, Start
 from .newton_iterations import correction_size, max_norm, powers_of
 
 
-# The search stops without a root where a correction leaves more than this fraction of the
-# residual: Newton's method is then cheaper.
+# The search stops without a root where two corrections in a row leave more than the square
+# of this fraction of the residual: Newton's method is then cheaper. A single correction can
+# leave more, because residuals of the two constraint levels shrink in turn.
 _SHRINKS = 0.5
-# The smallest contraction that the estimate of the next residual assumes. Residuals of the
-# two constraint levels shrink in turn, so a single quotient can be far too small: without
-# this bound two hinged bodies in space leak 3e-15 J a step; with it, 1e-16 J.
+# The smallest contraction that the estimate of the next residual assumes. For the same
+# reason a single quotient can be far too small: without this bound two hinged bodies in
+# space leak 3e-15 J a step; with it, 1e-16 J.
 _LEAST_CONTRACTION = 1e-2
 # The search also stops without a root after this many corrections.
 _PATIENCE = 16
@@ -84,6 +85,7 @@ def chord_iterations(
         shrinks = contraction < _SHRINKS
         done = done | (~shrinks & (defect <= powers.round_off) & (size <= powers.small))
         done = done & jnp.isfinite(size)
+        stalls = ~shrinks & ~(contraction * before.contraction < _SHRINKS**2)
         late = before.corrections + 1 >= _PATIENCE
         return _Chord(
             x=x,
@@ -91,7 +93,7 @@ def chord_iterations(
             contraction=contraction,
             corrections=before.corrections + 1,
             done=done,
-            failed=~done & (~shrinks | late | ~jnp.isfinite(size)),
+            failed=~done & (stalls | late | ~jnp.isfinite(size)),
         )
 
     first = _Chord(

@@ -77,6 +77,16 @@ class Newton(eqx.Module):
                 )
 
 
+class ChordAlone(eqx.Module):
+    """The chord method, where the equations have one, without Newton's method behind it.
+
+    The exact Jacobian is more than half of the program of a step, and smooth motion does
+    not need it. `newton` has the tolerances; it searches where there is no chord method.
+    """
+
+    newton: Newton
+
+
 class Start(eqx.Module):
     """The initial data of a search.
 

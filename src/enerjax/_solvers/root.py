@@ -19,7 +19,7 @@ from .._programs import in_one_function, is_known, simplified
 from .._types import Flag, Scalar
 from .linear.dense import AbstractFactors
 from .linear.jacobian import Linearisable
-from .newton import Start
+from .newton import ChordAlone, Start
 from .root_finding import (
     Chord,
     flat_of,
@@ -98,7 +98,7 @@ def _null_space_rate(
 
 def find_root(
     fn: Callable[[PyTree[Array], Any], PyTree[Array]],
-    root_finder: RootFinder,
+    root_finder: RootFinder | ChordAlone,
     guess: PyTree[Array],
     args: PyTree,
     *,
@@ -129,9 +129,9 @@ def find_root(
     of them, but to no less than `least`.
 
     With a `chord`, and if `by_chord` is true, `Newton` first tries the chord method, and
-    uses the exact Jacobian only where that fails. The root and its derivatives are those of
-    `fn` in either case. If Jacobians are needed `rarely`, their program is one that
-    compiles quickly.
+    uses the exact Jacobian only where that fails; `ChordAlone` finds no root there. The
+    root and its derivatives are those of `fn` in either case. If Jacobians are needed
+    `rarely`, their program is one that compiles quickly.
     """
     flat, _ = ravel_pytree(guess)
     start = Start(

@@ -16,7 +16,7 @@ from .._types import Count, Flag, Scalar
 from .chord_iterations import chord_iterations
 from .linear.dense import AbstractFactors, Inverse, SMALL
 from .linear.jacobian import Linearisable, linearisable
-from .newton import Newton, Start
+from .newton import ChordAlone, Newton, Start
 from .newton_iterations import max_norm, newton_iterations
 
 
@@ -74,7 +74,7 @@ def with_jacobian(
     fn: Callable[[Array, Any], Array],
     like: Float[Array, " n"],
     args: Any,
-    root_finder: RootFinder,
+    root_finder: RootFinder | ChordAlone,
     regularisation: Float[Array, " n"] | None,
     start: Start,
     chord: Chord | None,
@@ -97,11 +97,16 @@ def with_jacobian(
 def search(
     fn: Callable[[PyTree[Array], Any], PyTree[Array]],
     chord: Chord | None,
-    root_finder: RootFinder,
+    root_finder: RootFinder | ChordAlone,
     args: PyTree,
     start: Start,
     max_iterations: int,
 ) -> Root:
+    if isinstance(root_finder, ChordAlone):
+        newton = root_finder.newton
+        if chord is not None:
+            return in_one_function(lambda: _by_chord(fn, chord, newton, args, start))()
+        root_finder = newton
     if not isinstance(root_finder, Newton):
         solution = optx.root_find(
             fn, root_finder, start.guess, args, max_steps=max_iterations, throw=False
