@@ -18,6 +18,7 @@ from .long_run import checked_options, run_long
 from .loop import run_loop
 from .saving import RecordedRun, SaveAt, saving_of, with_events
 from .solution import first_rows, Solution
+from .stage import has_parts
 from .step_sizes import AbstractController, EqualSteps, find_end
 from .task import Task
 from .watcher import watcher_of
@@ -166,7 +167,7 @@ def _whole(task: Task, num_rows: int) -> tuple[Solution, Scalar]:
             task = dataclasses.replace(task, plan=task.plan.rounded_up())
         quick = chord_alone(task)
     solution, reached, by_chord = _run(task if quick is None else quick)
-    if quick is not None and by_chord and needs_jacobian(task, solution.result):
+    if by_chord and needs_jacobian(task, solution.result):
         solution, reached, _ = _run(task)
     if solution.ts.size > num_rows:
         solution = first_rows(solution, num_rows)
@@ -175,7 +176,7 @@ def _whole(task: Task, num_rows: int) -> tuple[Solution, Scalar]:
 
 @compiled
 def _run(task: Task) -> tuple[Solution, Scalar, bool]:
-    """The program of a run in one piece, which also tells whether it has a chord method."""
+    """The program of a run in one piece; also whether it leaves out the exact Jacobian."""
     plan, saving, stepper = task.plan, task.saving, task.stepper()
     model = stepper.model
     start = model.to_internal(task.start)
@@ -191,4 +192,5 @@ def _run(task: Task) -> tuple[Solution, Scalar, bool]:
     rows = saving.rows(run)
     happened = task.events(model, record, rows.multipliers)
     solution = dataclasses.replace(task.solution(model, rows, end), events=happened)
-    return solution, plan.time(end.place), end.warm.stages.chord_wait is not None
+    by_chord = has_parts(task.root_finder, end.warm.stages)
+    return solution, plan.time(end.place), by_chord

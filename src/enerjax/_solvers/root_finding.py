@@ -103,10 +103,10 @@ def search(
     max_iterations: int,
 ) -> Root:
     if isinstance(root_finder, ChordAlone):
-        newton = root_finder.newton
         if chord is not None:
-            return in_one_function(lambda: _by_chord(fn, chord, newton, args, start))()
-        root_finder = newton
+            # Two functions compile faster than one that has the length of both.
+            return _by_chord(fn, chord, root_finder.newton, args, start, in_one_function)
+        root_finder = root_finder.newton
     if not isinstance(root_finder, Newton):
         solution = optx.root_find(
             fn, root_finder, start.guess, args, max_steps=max_iterations, throw=False
@@ -156,9 +156,11 @@ def _by_chord(
     newton: Newton,
     args: PyTree,
     start: Start,
+    part: Callable[[Callable], Callable] = lambda fn: fn,
 ) -> Root:
+    """A search whose two parts, factorisation and corrections, are compiled by `part`."""
     guess, unravel = ravel_pytree(start.guess)
-    prepared = chord.prepare(start.guess, args)
+    prepared = part(lambda: chord.prepare(start.guess, args))()
     leaves_of = lambda tree: tuple(jax.tree.leaves(tree))
     joined = lambda leaves: jnp.concatenate([x.ravel() for x in leaves])
 
@@ -171,7 +173,7 @@ def _by_chord(
         correct = lambda x: leaves_of(chord.correct(unravel(x), args, prepared))
         return joined(unmerged(correct)(right))
 
-    last = chord_iterations(value, solve, newton, start, guess)
+    last = part(lambda: chord_iterations(value, solve, newton, start, guess))()
     return Root(
         value=unravel(last.x),
         factors=start.factors,

@@ -1,6 +1,5 @@
 """The coordinates and velocities of rigid bodies in space, as tables of indices."""
 
-import itertools
 from collections.abc import Sequence
 from typing import Any, TypeAlias
 
@@ -10,11 +9,11 @@ from jaxtyping import Array, Float
 
 from ..._programs import Indices
 from ..._types import Coordinates, Velocities
-from .vectors import Vector3
+from .vectors import Axes, Vector3
 
 
-# The mass centre and the three directors of all bodies, or their rates, or gradients.
-Pose: TypeAlias = Sequence[Vector3]
+# The mass centres and the directors of all bodies, or their rates, or gradients.
+Pose: TypeAlias = tuple[Vector3, Axes]
 
 
 def body_table(rigid_bodies: Any) -> Indices:
@@ -66,22 +65,26 @@ class RigidBodies(Indices):
 
     def pose(self, q: Coordinates) -> Pose:
         """The mass centres and directors of all bodies, or their rates or gradients."""
-        return _vectors(_entries(q, self.q).reshape(-1, 12))
+        rows = _entries(q, self.q).reshape(-1, 12).T
+        return rows[:3], rows[3:].reshape(3, 3, -1)
 
     def vectors(self, v: Velocities) -> tuple[Vector3, Vector3]:
         """The translational and the rotational parts of the velocities."""
-        moved, turned = _vectors(_entries(v, self.v).reshape(-1, 6))
-        return moved, turned
+        rows = _entries(v, self.v).reshape(-1, 6).T
+        return rows[:3], rows[3:]
 
     def coordinates(self, pose: Pose, others: Float[Array, " n"]) -> Coordinates:
         """The inverse of `pose`, with the values of the other coordinates."""
-        return _joined(_rows(pose), self.q, others, self.other_q)
+        centres, axes = pose
+        rows = jnp.concatenate([centres, axes.reshape(9, -1)])
+        return _joined(rows.T.ravel(), self.q, others, self.other_q)
 
     def velocities(
         self, moved: Vector3, turned: Vector3, others: Float[Array, " n"]
     ) -> Velocities:
         """The inverse of `vectors`, with the values of the other velocities."""
-        return _joined(_rows((moved, turned)), self.v, others, self.other_v)
+        rows = jnp.concatenate([moved, turned])
+        return _joined(rows.T.ravel(), self.v, others, self.other_v)
 
     def others(self, q: Coordinates) -> Float[Array, " n"]:
         """The coordinates that belong to no rigid body."""
@@ -118,15 +121,6 @@ def _entries(x: Array, index: np.ndarray) -> Array:
     if np.array_equal(flat, np.arange(flat[0], flat[0] + flat.size)):
         return x[flat[0] : flat[0] + flat.size]
     return x[flat]
-
-
-def _vectors(rows: Float[Array, "bodies n"]) -> list[Vector3]:
-    columns = [rows[:, k] for k in range(rows.shape[1])]
-    return [columns[k : k + 3] for k in range(0, len(columns), 3)]
-
-
-def _rows(vectors: Sequence[Vector3]) -> Float[Array, " bodies*n"]:
-    return jnp.stack(list(itertools.chain(*vectors)), axis=1).ravel()
 
 
 def _joined(x: Array, at: np.ndarray, y: Array, others: np.ndarray) -> Array:

@@ -30,12 +30,10 @@ from ..._types import Coordinates, Increments, Velocities
 from .base import AbstractKinematics
 from .rigid_bodies import RigidBodies
 from .vectors import (
-    added,
     cross,
     dot,
     in_axes,
     rates_of_directors,
-    scaled,
     sum_of_products,
     Vector3,
 )
@@ -90,16 +88,16 @@ class RigidKinematics(AbstractKinematics):
         return q[:0]
 
     def velocity(self, q, v):
-        bodies, (moved, *rates) = self.bodies, self.bodies.pose(v)
-        _, *axes = bodies.pose(q)
-        spin = scaled(0.5, in_axes(axes, sum_of_products(axes, rates)))
+        bodies, (moved, rates) = self.bodies, self.bodies.pose(v)
+        _, axes = bodies.pose(q)
+        spin = 0.5 * in_axes(axes, sum_of_products(axes, rates))
         return bodies.velocities(moved, spin, bodies.others(v))
 
     def user_velocity(self, q, v):
-        bodies, (_, *axes) = self.bodies, self.bodies.pose(q)
+        bodies, (_, axes) = self.bodies, self.bodies.pose(q)
         moved, turned = bodies.vectors(v)
         rates = rates_of_directors(axes, turned)
-        return bodies.coordinates([moved, *rates], bodies.other_rates(v))
+        return bodies.coordinates((moved, rates), bodies.other_rates(v))
 
     def inertia(self, of_user, energy, dtype):
         bodies = self.bodies
@@ -126,26 +124,25 @@ class RigidKinematics(AbstractKinematics):
         bodies = self.bodies
         moved, turned = bodies.vectors(step)
         polar = jnp.sqrt(0.5 * dot(turned, turned))
-        return bodies.coordinates([moved, *[[polar] * 3] * 3], bodies.other_rates(step))
+        axes = jnp.broadcast_to(polar, (3, 3, polar.size))
+        return bodies.coordinates((moved, axes), bodies.other_rates(step))
 
     def frames(self, q, jacobian, args):
         return None
 
     def displacement(self, q, step):
-        bodies, (_, *axes) = self.bodies, self.bodies.pose(q)
+        bodies, (_, axes) = self.bodies, self.bodies.pose(q)
         moved, turned = bodies.vectors(step)
-        half = scaled(0.5, turned)
+        half = 0.5 * turned
         once = rates_of_directors(axes, half)
         twice = rates_of_directors(once, half)
-        factor = 2 / (1 + dot(half, half))
-        change = [scaled(factor, added(x, y)) for x, y in zip(once, twice, strict=True)]
-        return bodies.coordinates([moved, *change], bodies.other_rates(step))
+        change = 2 / (1 + dot(half, half)) * (once + twice)
+        return bodies.coordinates((moved, change), bodies.other_rates(step))
 
     def pull_back(self, qa, qb, gradient):
-        bodies, (force, *torques) = self.bodies, self.bodies.pose(gradient)
-        (_, *first), (_, *last) = bodies.pose(qa), bodies.pose(qb)
-        mean = [scaled(0.5, added(x, y)) for x, y in zip(first, last, strict=True)]
-        torque = in_axes(first, sum_of_products(mean, torques))
+        bodies, (force, torques) = self.bodies, self.bodies.pose(gradient)
+        (_, first), (_, last) = bodies.pose(qa), bodies.pose(qb)
+        torque = in_axes(first, sum_of_products(0.5 * (first + last), torques))
         return bodies.velocities(force, torque, bodies.others(gradient))
 
     def push(self, qa, qb, step, args):
@@ -165,10 +162,10 @@ class RigidKinematics(AbstractKinematics):
 
     def momentum_change(self, qa, qb, change, mean, step, args):
         bodies = self.bodies
-        half = scaled(0.5, bodies.vectors(step)[1])
+        half = 0.5 * bodies.vectors(step)[1]
         end = bodies.vectors(mean + 0.5 * change)[1]
         once = cross(half, end)
-        rotated = scaled(2 / (1 + dot(half, half)), added(once, cross(half, once)))
+        rotated = 2 / (1 + dot(half, half)) * (once + cross(half, once))
         return change + self._rotational(rotated, qa)
 
     def gyroscopic(self, q, momentum, rates, args):
@@ -179,7 +176,7 @@ class RigidKinematics(AbstractKinematics):
     def _rotational(self, torque: Vector3, q: Coordinates) -> Increments:
         """Rows with these torques, and zeros otherwise."""
         others = jnp.zeros_like(self.bodies.others(q))
-        return self.bodies.velocities([jnp.zeros_like(x) for x in torque], torque, others)
+        return self.bodies.velocities(jnp.zeros_like(torque), torque, others)
 
     # For rotations the discrete gradients of `psi`, where `S` is the one with respect to
     # the rates, rest on the identity, for the rates `Y_i = R (W x e_i)` of the directors,
@@ -196,20 +193,21 @@ class RigidKinematics(AbstractKinematics):
     def momentum_of_rates(self, a, b, step, lowered):
         # In the rotations it is `sum e_i x Rm^-1 S_i`.
         (qa, by_a), (_, by_b) = a, b
-        bodies, (_, *axes) = self.bodies, self.bodies.pose(qa)
-        moved, *of_rates = bodies.pose(0.5 * (by_a + by_b))
-        half = scaled(0.5, bodies.vectors(step)[1])
+        bodies, (_, axes) = self.bodies, self.bodies.pose(qa)
+        moved, of_rates = bodies.pose(0.5 * (by_a + by_b))
+        half = 0.5 * bodies.vectors(step)[1]
         # In body axes `Rm^-1 S_i` is `y_i - t x y_i` with `y_i = R_a^T S_i`.
-        y = [in_axes(axes, x) for x in of_rates]
-        z = [added(x, scaled(-1.0, cross(half, x))) for x in y]
-        spin = [z[1][2] - z[2][1], z[2][0] - z[0][2], z[0][1] - z[1][0]]
+        y = in_axes(axes, of_rates)
+        z = y - cross(half[None], y)
+        skew = z - jnp.swapaxes(z, 0, 1)
+        spin = jnp.stack([skew[1, 2], skew[2, 0], skew[0, 1]])
         return bodies.velocities(moved, spin, bodies.others(0.5 * (by_a + by_b)))
 
     def spin_rows(
         self, qa: Coordinates, mean_rate: Coordinates, by_rate: Coordinates
     ) -> Increments:
         """The rows `sum Ym_i x S_i`."""
-        bodies, (_, *axes) = self.bodies, self.bodies.pose(qa)
-        (_, *rates), (_, *of_rates) = bodies.pose(mean_rate), bodies.pose(by_rate)
+        bodies, (_, axes) = self.bodies, self.bodies.pose(qa)
+        (_, rates), (_, of_rates) = bodies.pose(mean_rate), bodies.pose(by_rate)
         torque = in_axes(axes, sum_of_products(rates, of_rates))
         return self._rotational(torque, qa)

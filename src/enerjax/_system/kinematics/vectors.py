@@ -1,56 +1,51 @@
 """Vectors in space, of all bodies at once.
 
-A vector is a list of three components, which are arrays with an entry for each body.
-Written in components, formulas compile to a single loop over the bodies. With arrays of
-vectors XLA would compute the operands of each vector product several times.
+A vector is an array of shape `(3, bodies)`, the axes of all bodies one of shape `(3, 3,
+bodies)`: first the number of the axis, then the component. Formulas for them have a third of
+the operations that formulas for single components have, and compile in as much less time.
 """
 
-from collections.abc import Sequence
 from typing import TypeAlias
 
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
 Component: TypeAlias = Float[Array, " bodies"]
-Vector3: TypeAlias = Sequence[Component]
-
-
-def added(a: Vector3, b: Vector3) -> Vector3:
-    return [x + y for x, y in zip(a, b, strict=True)]
-
-
-def scaled(factor: Array | float, a: Vector3) -> Vector3:
-    return [factor * x for x in a]
+Vector3: TypeAlias = Float[Array, "3 bodies"]
+# Three vectors for each body: its directors, their rates, or gradients with respect to them.
+Axes: TypeAlias = Float[Array, "3 3 bodies"]
 
 
 def dot(a: Vector3, b: Vector3) -> Component:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return jnp.sum(a * b, axis=0)
 
 
-def cross(a: Vector3, b: Vector3) -> Vector3:
-    return [
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    ]
+def cross(
+    a: Float[Array, "*n 3 bodies"], b: Float[Array, "*n 3 bodies"]
+) -> Float[Array, "*n 3 bodies"]:
+    (a1, a2), (b1, b2) = _next_two(a, axis=-2), _next_two(b, axis=-2)
+    return a1 * b2 - a2 * b1
 
 
-def sum_of_products(a: Sequence[Vector3], b: Sequence[Vector3]) -> Vector3:
+def sum_of_products(a: Axes, b: Axes) -> Vector3:
     """`sum a_i x b_i`"""
-    x, y, z = (cross(a_i, b_i) for a_i, b_i in zip(a, b, strict=True))
-    return added(added(x, y), z)
+    return jnp.sum(cross(a, b), axis=0)
 
 
-def in_axes(axes: Sequence[Vector3], vector: Vector3) -> Vector3:
-    """The components of a vector in body axes."""
-    return [dot(axis, vector) for axis in axes]
+def in_axes(axes: Axes, vectors: Float[Array, "*n 3 bodies"]) -> Array:
+    """The components of vectors in body axes."""
+    return jnp.sum(axes * vectors[..., None, :, :], axis=-2)
 
 
-def rates_of_directors(axes: Sequence[Vector3], spin: Vector3) -> list[Vector3]:
+def rates_of_directors(axes: Axes, spin: Vector3) -> Axes:
     """The rates `R (W x e_i)` of the directors; linear in the directors."""
-    combined = lambda p, a, q, b: added(scaled(p, a), scaled(-q, b))
-    return [
-        combined(spin[2], axes[1], spin[1], axes[2]),
-        combined(spin[0], axes[2], spin[2], axes[0]),
-        combined(spin[1], axes[0], spin[0], axes[1]),
-    ]
+    (w1, w2), (d1, d2) = _next_two(spin, axis=0), _next_two(axes, axis=0)
+    return w2[:, None] * d1 - w1[:, None] * d2
+
+
+def _next_two(x: Array, axis: int) -> tuple[Array, Array]:
+    """The entries `1, 2, 0` and `2, 0, 1` along an axis of three."""
+    first, others = jnp.split(x, [1], axis)
+    before, last = jnp.split(x, [2], axis)
+    return jnp.concatenate([others, first], axis), jnp.concatenate([last, before], axis)
