@@ -23,7 +23,11 @@ from .jaxprs import (
     programs_within as programs_within,
     wrapped_program as wrapped_program,
 )
-from .one_function.api import in_one_function as in_one_function, unmerged as unmerged
+from .one_function.api import (
+    in_one_function as in_one_function,
+    part as part,
+    unmerged as unmerged,
+)
 from .one_function.obstacles import why_not_one_function as why_not_one_function
 from .one_function.possible import LARGEST_SUM as LARGEST_SUM
 from .one_function.products import plain_products as plain_products, summed as summed

@@ -23,7 +23,7 @@ from .._system import State
 from .._types import Count, Flag, Scalar
 from ..schemes import AbstractOneSolveScheme, AbstractSchemeWithMemory, StepEnd
 from .prediction import Memory
-from .stage import first_memory, has_parts, num_unknowns, solve, Solved, unsolved
+from .stage import first_memory, is_chord_alone, num_unknowns, solve, Solved, unsolved
 
 
 # The default for large systems: their steps take far longer than compiling the division.
@@ -89,7 +89,7 @@ def solve_or_divide(
     if max_halvings is None:
         is_large = num_unknowns(memory) > SMALL
         max_halvings = _HALVINGS_OF_LARGE_SYSTEMS if is_large else 0
-    if has_parts(root_finder, memory):
+    if is_chord_alone(root_finder, memory):
         max_halvings = 0
     if max_halvings == 0:
         return step.solve(), jnp.array(0)

@@ -19,7 +19,6 @@ from .event_search import Found, no_search, settle, Watch
 from .halving import select
 from .reverse import keep_roots, loops
 from .saving import Begin, Costs, Record, with_time
-from .stage import has_parts
 from .step import advance, first_warm, model_for, StepOutput, Warm
 from .step_sizes import AbstractPlan, Verdict
 from .watcher import Happening, Watcher
@@ -331,12 +330,8 @@ def run_loop(
             done = done | progress.watch.ended
         return done if is_whole else done | (progress.completed >= plan.max_attempts)
 
-    begin = stepper.begin(start)
     over_groups, over_steps = loops(
-        num_groups,
-        steps_in_group,
-        None if plan.is_counted else is_done,
-        in_parts=has_parts(stepper.root_finder, begin.warm.stages),
+        num_groups, steps_in_group, None if plan.is_counted else is_done
     )
 
     def one_step(progress: Progress, live: Flag) -> tuple[Progress, Attempt]:
@@ -358,6 +353,7 @@ def run_loop(
             varying=after.varying,
         )
 
+    begin = stepper.begin(start)
     kept = Begin(
         kept=keep(stepper.model_at(begin))(begin.state, begin.place),
         multipliers=begin.multipliers,

@@ -38,22 +38,19 @@ def keep_roots(fn: Body) -> Body:
 
 
 def loops(
-    groups: int, steps: int, done: Callable[[Any], Array] | None, *, in_parts: bool = False
+    groups: int, steps: int, done: Callable[[Any], Array] | None
 ) -> tuple[Scan, Scan]:
     """The loops over the groups of steps of a run, and over the steps of a group.
 
     A segment that begins after `done(carry)` is skipped, and its outputs are zero; in a
-    batch it is skipped when all lanes are done. `None` if all segments are needed. If steps
-    are compiled `in_parts`, segments are not.
+    batch it is skipped when all lanes are done. `None` if all segments are needed.
     """
     total = groups * steps
     length = math.isqrt(total)
     # One of the loops is divided: a segment consists of whole groups, or is part of one.
     if steps > length:
-        return _scan, functools.partial(_in_segments, total, length, in_parts, done=done)
-    in_segments = functools.partial(
-        _in_segments, total, length // steps, in_parts, done=done
-    )
+        return _scan, functools.partial(_in_segments, total, length, done=done)
+    in_segments = functools.partial(_in_segments, total, length // steps, done=done)
     return in_segments, _scan
 
 
@@ -64,7 +61,6 @@ def _scan(body: Body, carry: Any, count: int, live: Flag) -> tuple[Any, Any]:
 def _in_segments(
     total: int,
     length: int,
-    in_parts: bool,
     body: Body,
     carry: Any,
     count: int,
@@ -86,9 +82,7 @@ def _in_segments(
         one_pass = lambda carry, k: body(carry, live & (first + k < count))
         return jax.lax.scan(one_pass, carry, jnp.arange(size))
 
-    segment = keep_roots(passes)
-    if not in_parts:
-        segment = in_one_function(segment)
+    segment = in_one_function(keep_roots(passes))
     if total > LONG:
         segment = _checkpoint(segment)
     if done is not None:

@@ -18,7 +18,7 @@ from .long_run import checked_options, run_long
 from .loop import run_loop
 from .saving import RecordedRun, SaveAt, saving_of, with_events
 from .solution import first_rows, Solution
-from .stage import has_parts
+from .stage import is_chord_alone
 from .step_sizes import AbstractController, EqualSteps, find_end
 from .task import Task
 from .watcher import watcher_of
@@ -166,8 +166,8 @@ def _whole(task: Task, num_rows: int) -> tuple[Solution, Scalar]:
         if task.watcher is None:
             task = dataclasses.replace(task, plan=task.plan.rounded_up())
         quick = chord_alone(task)
-    solution, reached, by_chord = _run(task if quick is None else quick)
-    if by_chord and needs_jacobian(task, solution.result):
+    solution, reached, alone = _run(task if quick is None else quick)
+    if alone and needs_jacobian(task, solution.result):
         solution, reached, _ = _run(task)
     if solution.ts.size > num_rows:
         solution = first_rows(solution, num_rows)
@@ -192,5 +192,5 @@ def _run(task: Task) -> tuple[Solution, Scalar, bool]:
     rows = saving.rows(run)
     happened = task.events(model, record, rows.multipliers)
     solution = dataclasses.replace(task.solution(model, rows, end), events=happened)
-    by_chord = has_parts(task.root_finder, end.warm.stages)
-    return solution, plan.time(end.place), by_chord
+    alone = is_chord_alone(task.root_finder, end.warm.stages)
+    return solution, plan.time(end.place), alone

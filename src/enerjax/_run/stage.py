@@ -15,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from .._operators import AbstractModel, Increment, roughness, scales_like, shortened
-from .._programs import in_one_function
+from .._programs import part
 from .._results import first_failure, from_root_finder, RESULTS
 from .._solvers import (
     AbstractFactors,
@@ -125,8 +125,9 @@ def solve(
 ) -> Solved:
     """Solves a step of length `h`. With `skip` it makes no iteration; see `find_root`."""
     problem = step_problem(scheme, model, start, h, memory.carried)
-    part = in_one_function if has_parts(root_finder, memory) else lambda fn: fn
-    prepared = part(lambda: _prepared(scheme, problem, model, start, h, memory))()
+    # Steps by the chord method are the longest programs.
+    apart = (lambda fn: fn) if memory.chord_wait is None else part
+    prepared = apart(lambda: _prepared(scheme, problem, model, start, h, memory))()
     unknown_scale, row_scale = prepared.unknown_scale, prepared.row_scale
 
     def scaled(x, inputs):
@@ -151,17 +152,11 @@ def solve(
         rarely=rarely or wait is not None,
     )
     step = scheme, problem, model, start, memory, prepared
-    return part(lambda: _solved(*step, root, root_finder))()
+    return apart(lambda: _solved(*step, root, root_finder))()
 
 
-def has_parts(root_finder: RootFinder | ChordAlone, memory: Memory) -> bool:
-    """Whether a step is compiled into a function for each of its parts, and not into one.
-
-    Without the exact Jacobian each part can be a function of machine code, at any size. The
-    time of compilation grows faster than the length of a function: an arm of four bodies
-    compiles in 9 s in parts and in 20 s as one function, and takes 31 us a step instead of
-    26 us.
-    """
+def is_chord_alone(root_finder: RootFinder | ChordAlone, memory: Memory) -> bool:
+    """Whether the exact Jacobian is left out, because there is a chord method."""
     return isinstance(root_finder, ChordAlone) and memory.chord_wait is not None
 
 
@@ -239,7 +234,7 @@ def _solved(
     reverses, no = lambda: _gradients_reverse(model, start, end.state), jnp.array(False)
     if memory.chord_wait is not None:
         # Where the chord method converges, the gradients have hardly changed.
-        alone, by_newton = has_parts(root_finder, memory), reverses
+        alone, by_newton = is_chord_alone(root_finder, memory), reverses
         reverses = lambda: (
             no if alone else jax.lax.cond(root.by_chord, lambda: no, by_newton)
         )

@@ -47,9 +47,10 @@ def _root_jvp(primals, tangents):
     # The search is compiled as a function of its own, because it is not differentiated.
     again = lambda: _root(fn, chord, root_finder, args, start, max_iterations)
     root = in_one_function(again)()
-    # The derivatives of a step use these results of the search, and no others.
+    # The derivatives of a step use these results of the search, and no others: with one
+    # that is not kept, the reverse pass would search again.
     root = eqx.tree_at(
-        lambda root: (root.value, root.found, root.broken, root.finite),
+        lambda root: (root.value, root.found, root.broken, root.finite, root.by_chord),
         root,
         replace_fn=lambda x: jax.tree.map(lambda x: checkpoint_name(x, ROOT), x),
     )

@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 from typing_extensions import TypeAliasType
 
-from .._programs import in_one_function, unmerged
+from .._programs import part, unmerged
 from .._types import Count, Flag, Scalar
 from .chord_iterations import chord_iterations
 from .linear.dense import AbstractFactors, Inverse, SMALL
@@ -104,8 +104,7 @@ def search(
 ) -> Root:
     if isinstance(root_finder, ChordAlone):
         if chord is not None:
-            # Two functions compile faster than one that has the length of both.
-            return _by_chord(fn, chord, root_finder.newton, args, start, in_one_function)
+            return _by_chord(fn, chord, root_finder.newton, args, start)
         root_finder = root_finder.newton
     if not isinstance(root_finder, Newton):
         solution = optx.root_find(
@@ -134,14 +133,12 @@ def search(
     exact = with_jacobian(flat_fn, flat, args, root_finder, regularisation, start, chord)
     if chord is None or root_finder.linear_solver is not None:
         return _iterated(exact, root_finder, start, max_iterations)
-    # Separate from the Newton search, which may not be compilable into one function.
-    by_chord = lambda: _by_chord(fn, chord, root_finder, args, start)
-    first = in_one_function(by_chord)()
+    first = _by_chord(fn, chord, root_finder, args, start)
 
     def again() -> Root:
         # Under `vmap` this is evaluated for all lanes, also for those with a root.
         left = eqx.tree_at(lambda start: start.skip, start, start.skip | first.found)
-        last = _iterated(exact, root_finder, left, max_iterations)
+        last = part(lambda: _iterated(exact, root_finder, left, max_iterations))()
         last = eqx.tree_at(
             lambda root: root.iterations, last, last.iterations + first.iterations
         )
@@ -156,9 +153,7 @@ def _by_chord(
     newton: Newton,
     args: PyTree,
     start: Start,
-    part: Callable[[Callable], Callable] = lambda fn: fn,
 ) -> Root:
-    """A search whose two parts, factorisation and corrections, are compiled by `part`."""
     guess, unravel = ravel_pytree(start.guess)
     prepared = part(lambda: chord.prepare(start.guess, args))()
     leaves_of = lambda tree: tuple(jax.tree.leaves(tree))

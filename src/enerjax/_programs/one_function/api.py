@@ -19,12 +19,27 @@ def in_one_function(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Ar
     values they keep. The lanes of a batch run one after the other, each with the iterations
     that it needs.
     """
+    return _called(fn, is_part=False)
+
+
+def part(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Array]]:
+    """`in_one_function(fn)` for a part of a program that may be one function as a whole.
+
+    It is a function of its own only if the whole is none, for example because it is long:
+    the time of compilation grows faster than the length of a function.
+    """
+    return _called(fn, is_part=True)
+
+
+def _called(
+    fn: Callable[..., PyTree[Array]], is_part: bool
+) -> Callable[..., PyTree[Array]]:
     if not has_marks():
         return fn
     # Imported here, because other versions of JAX may define primitives in another way.
     from .program import call
 
-    return functools.partial(call, fn)
+    return functools.partial(call, fn, is_part)
 
 
 def unmerged(fn: Callable[..., tuple[Array, ...]]) -> Callable[..., tuple[Array, ...]]:

@@ -9,7 +9,7 @@ from jaxtyping import Array, PyTree
 
 from ..counting import num_equations
 from .marks import has_marks
-from .possible import LARGEST_PROGRAM, obstacles
+from .possible import has_parts, longest, obstacles
 
 
 def why_not_one_function(
@@ -30,8 +30,10 @@ def why_not_one_function(
     if Program(closed.jaxpr, known, 0).is_possible:
         return ()
     length = num_equations(closed.jaxpr)
-    if length > LARGEST_PROGRAM:
-        return (f"its length, {length} array operations, which would compile slowly",)
+    if length > longest(closed.jaxpr):
+        parts = "; its parts are functions" if has_parts(closed.jaxpr) else ""
+        reason = f"its length, {length} array operations, which would compile slowly"
+        return (reason + parts,)
     names = {_name(x[-1]) for x in obstacles(rewritten(closed.jaxpr, known).jaxpr)}
     # The lines are those of the program as it was written.
     lines = {_name(x[-1]): _line(x) for x in obstacles(closed.jaxpr)}

@@ -14,14 +14,17 @@ from jaxtyping import Array, PyTree
 
 from ..counting import num_equations
 from .marks import marked
-from .possible import is_possible, LARGEST_PROGRAM, NAME
+from .possible import has_parts, is_possible, longest, NAME
 from .rewriting import as_index, REWRITTEN, rewritten
 
 
-def call(fn: Callable[..., PyTree[Array]], *args: PyTree[Array]) -> PyTree[Array]:
+def call(
+    fn: Callable[..., PyTree[Array]], is_part: bool, *args: PyTree[Array]
+) -> PyTree[Array]:
     """`fn(*args)` in one function, if it can be."""
     closed, like = jax.make_jaxpr(fn, return_shape=True)(*args)
-    out = _run(closed, jax.tree.leaves(args), [True] * len(closed.out_avals))
+    wanted = [True] * len(closed.out_avals)
+    out = _run(closed, jax.tree.leaves(args), wanted, is_part)
     return jax.tree.unflatten(jax.tree.structure(like), map(jnp.asarray, out))
 
 
@@ -31,11 +34,20 @@ class Program:
     - `jaxpr`: its constants are passed as the first inputs. They can be traced, and a
       program that held them would outlive their trace.
     - `known`: the values of those inputs that are known indices; `None` for the others.
+    - `is_part`: whether the program is a part of one that may be one function as a whole.
+      The part is then no function of its own.
     - `linear`: the number of inputs, the last ones, that the program is linear in.
     """
 
-    def __init__(self, jaxpr: Any, known: Sequence[np.ndarray | None], linear: int):
+    def __init__(
+        self,
+        jaxpr: Any,
+        known: Sequence[np.ndarray | None],
+        is_part: bool = False,
+        linear: int = 0,
+    ):
         self.jaxpr = jaxpr
+        self.is_part = is_part
         self.known = known
         self.linear = linear
         # The program that is run, which is rewritten if need be (derivatives are taken of
@@ -43,9 +55,9 @@ class Program:
         self._executed, self._consts, self._fixed = None, [], [None] * len(known)
         # Evaluations outside of other programs share one compilation.
         self.compiled = jax.jit(lambda *numbers: self.run(numbers))
-        if num_equations(jaxpr) > LARGEST_PROGRAM:
+        if num_equations(jaxpr) > longest(jaxpr):
             return
-        if is_possible(jaxpr):
+        if is_possible(jaxpr) and not has_parts(jaxpr):
             self._executed = jaxpr
         elif is_possible(jaxpr, assumed=REWRITTEN):
             rewritten_program = rewritten(jaxpr, known)
@@ -77,7 +89,11 @@ def _values(jaxpr: Any, numbers: Sequence[Any]) -> list[Array]:
 
 
 def _run(
-    closed: ClosedJaxpr, inputs: Sequence[Any], wanted: Sequence[bool], linear: int = 0
+    closed: ClosedJaxpr,
+    inputs: Sequence[Any],
+    wanted: Sequence[bool],
+    is_part: bool,
+    linear: int = 0,
 ) -> list[Any]:
     """The wanted outputs of a program, in one function where that is possible.
 
@@ -91,7 +107,7 @@ def _run(
     jaxpr, of_consts, of_inputs = dce_jaxpr_consts(closed.jaxpr, computed)
     needed, _ = _split([*of_consts, *of_inputs], numbers)
     linear = sum(of_inputs[len(of_inputs) - linear :])
-    program = Program(jaxpr, list(map(as_index, needed)), linear)
+    program = Program(jaxpr, list(map(as_index, needed)), is_part, linear)
     needed = list(map(jnp.asarray, needed))
     if any(computed) and program.is_possible:
         out = ONE_FUNCTION.bind(*needed, program=program)
@@ -138,9 +154,9 @@ def _jvp(primals: Any, tangents: Any, *, program: Program) -> tuple[list, list]:
     num_values, num_others = sum(smooth), len(smooth) - sum(smooth)
     num_kept = len(closed.out_avals) - len(smooth)
     wanted = [True] * num_values + uses[:num_kept] + [True] * num_others
-    out = _run(closed, primals, wanted)
+    out = _run(closed, primals, wanted, program.is_part)
     kept = out[num_values : num_values + num_kept]
-    rates = _run(pushed, [*kept, *moved], depends, len(moved))
+    rates = _run(pushed, [*kept, *moved], depends, program.is_part, len(moved))
     out = _merged(smooth, out[:num_values], out[num_values + num_kept :])
     rates = _merged(smooth, rates, [None] * num_others)
     zeros = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in out]
@@ -169,7 +185,8 @@ def _transpose(cotangents: Any, *numbers: Any, program: Program) -> list:
 
     closed = jax.make_jaxpr(pulled)(known, cotangents)
     depends = _depends(closed, len(cotangents))
-    out = _run(closed, [*known, *cotangents], depends, len(cotangents))
+    inputs = [*known, *cotangents]
+    out = _run(closed, inputs, depends, program.is_part, len(cotangents))
     zeros = [ad.Zero(x.aval) for x in unknown]
     out = [x if on else zero for on, x, zero in zip(depends, out, zeros, strict=True)]
     return _merged(wanted, out, [None] * len(known))
@@ -188,13 +205,13 @@ def _lanes(numbers: Any, axes: Any, *, program: Program) -> tuple[list, list[int
     elif program.linear and not any(batched[:still]):
         # Many directions at one point share everything but the directions themselves.
         closed = jax.make_jaxpr(jax.vmap(of_lane))(own)
-        out = _run(closed, own, [True] * len(closed.out_avals), len(own))
+        out = _run(closed, own, [True] * len(closed.out_avals), program.is_part, len(own))
     else:
         # The lanes run one after the other. With few lanes side by side, calling the
         # operations would take longer than a whole lane in one function; many lanes side
         # by side do not fit into the cache.
-        bind = functools.partial(ONE_FUNCTION.bind, program=program)
-        out = jax.lax.map(lambda own: bind(*_merged(batched, own, shared)), own)
+        closed = jax.make_jaxpr(lambda own: jax.lax.map(of_lane, own))(own)
+        out = _run(closed, own, [True] * len(closed.out_avals), program.is_part)
     return out, [0] * len(out)
 
 

@@ -23,7 +23,7 @@ from jaxtyping import Array, Int
 from ..jaxprs import evaluate, interpret, programs_within, wrapped_program
 from ..numpy_primitives import evaluated
 from ..primitives import CONTRACTION, SCATTERS
-from .possible import is_small_product, LARGEST_SUM, NAME
+from .possible import is_part, is_small_product, LARGEST_SUM, NAME
 from .products import written_out
 
 
@@ -58,6 +58,10 @@ def _equation(eqn: Any, values: list[Any]) -> list[Any]:
         with jax.ensure_compile_time_eval():
             return list(map(np.asarray, evaluated(eqn.primitive, values, params)))
     if _must_be_replaced(eqn):
+        if is_part(eqn):
+            program = params["program"]
+            count = len(program.jaxpr.constvars)
+            return interpret(program.jaxpr, values[:count], values[count:], _equation)
         if name == CONTRACTION and eqn.outvars[0].aval.size <= LARGEST_SUM:
             left, right = values
             return [written_out(left, right, params["dimension_numbers"])]
@@ -86,6 +90,8 @@ def _must_be_replaced(eqn: Any) -> bool:
     name = eqn.primitive.name
     if name in _OF_PAIRS:
         return eqn.invars[0].aval.size > LARGEST_SUM
+    if is_part(eqn):
+        return True
     return name in SCATTERS or (name == CONTRACTION and not is_small_product(eqn))
 
 
@@ -93,7 +99,7 @@ def _needs_rewriting(jaxpr: Any) -> bool:
     return any(
         _must_be_replaced(eqn) or any(map(_needs_rewriting, programs_within(eqn)))
         for eqn in jaxpr.eqns
-        if eqn.primitive.name != NAME
+        if is_part(eqn) or eqn.primitive.name != NAME
     )
 
 
