@@ -230,3 +230,72 @@ def test_newton_follows_where_springs_are_too_stiff_for_the_chord():
     sol = ej.simulate(system, ej.EnergyPreserving(), start, stiffness, h=0.01, num_steps=60)
     energy = sol.audit.energy
     assert jnp.ptp(energy) <= 60 * 100 * EPS * energy[0]  # round-off
+
+
+# Programs without the exact Jacobian ------------------------------------------------------
+
+
+@pytest.fixture
+def searched_by(monkeypatch):
+    """The root finders of the programs that runs have used, by name."""
+    import sys
+
+    module, names = sys.modules["enerjax._run.simulate"], []
+    run = module._run
+
+    def recorded(task):
+        names.append(type(task.root_finder).__name__)
+        return run(task)
+
+    monkeypatch.setattr(module, "_run", recorded)
+    return names
+
+
+def test_a_run_that_needs_newton_is_made_again_with_it_once(searched_by):
+    """A falling chain of 8 points: the chord method is too slow for h = 0.01."""
+    system, start, args = ej.problems.chain(8)
+
+    def run(h):
+        searched_by.clear()
+        sol = ej.simulate(system, ej.EnergyPreserving(), start, args, h=h, num_steps=60)
+        return sol, list(searched_by)
+
+    assert run(0.002)[1] == ["ChordAlone"]
+    sol, names = run(0.01)
+    assert names == ["ChordAlone", "Newton"]
+    assert run(0.002)[1] == ["Newton"]  # remembered
+    energy = sol.audit.energy
+    assert jnp.ptp(energy) <= 60 * 100 * EPS * jnp.max(sol.audit.kinetic)  # round-off
+    # Under `jit` the program has both methods from the beginning. Solver: round-off.
+    both = jax.jit(
+        lambda h: ej.simulate(system, ej.EnergyPreserving(), start, args, h=h, num_steps=60)
+    )(0.01)
+    np.testing.assert_allclose(sol.ys.q, both.ys.q, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("damped", [False, True])
+def test_stiff_forces_are_noticed_before_the_first_program(searched_by, damped):
+    """A row of points on springs, or in dampers, of ten radians a step."""
+    size, h, strength = 12, 0.01, 1e3
+    stiffness = 0.0 if damped else strength**2
+    force = lambda q, v, t, args: -args["c"] * v
+    system = ej.System(
+        jnp.eye(2 * size),
+        lambda q, args: 0.5 * args["k"] * jnp.sum(q[1::2] ** 2) + 9.81 * jnp.sum(q[::2]),
+        lambda q, args: q[::2] - 0.1 * q[1::2] ** 2,
+        force=force if damped else None,
+    )
+    args = dict(k=stiffness, c=strength)
+    start = ej.initial_state(system, jnp.zeros(2 * size), jnp.ones(2 * size), args)
+    ej.simulate(system, ej.EnergyPreserving(), start, args, h=h, num_steps=3)
+    assert searched_by == ["Newton"]
+
+
+def test_a_failure_that_newton_cannot_mend_is_made_once(searched_by):
+    system, start, args = ej.problems.chain(8)
+    off = ej.State(start.q * 1.1, start.v)
+    sol = ej.simulate(
+        system, ej.EnergyPreserving(), off, args, h=1e-3, num_steps=3, throw=False
+    )
+    assert sol.result == ej.RESULTS.inconsistent_start
+    assert len(searched_by) == 1

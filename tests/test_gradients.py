@@ -127,6 +127,24 @@ def test_memory_of_the_reverse_pass_of_a_long_run():
     assert memory_of_the_reverse_pass(1_000_000) <= 2_300_000
 
 
+def test_the_reverse_pass_does_not_search_again():
+    """It uses the roots that the forward pass has found."""
+    system, begin, args = ej.problems.chain(8)
+
+    def end(h):
+        sol = ej.simulate(system, ej.EnergyPreserving(), begin, args, h=h, num_steps=4)
+        return sol.ys.q[-1, -1]
+
+    def searches(fn):
+        """The loops over iterates of Newton's method, which begin with two vectors."""
+        lines = jax.jit(fn).lower(1e-3).as_text().splitlines()
+        types = [line.rpartition(" : ")[2] for line in lines if "stablehlo.while" in line]
+        return sum(x.startswith("tensor<32xf64>, tensor<32xf64>") for x in types)
+
+    assert searches(end) >= 1
+    assert searches(jax.grad(end)) == searches(end)
+
+
 @pytest.mark.slow
 def test_second_derivatives_exist():
     fn = lambda g: end(parameters() | dict(g=g), SCHEMES["decaying"])

@@ -6,7 +6,8 @@ length, so dividing a step costs nothing but its uniform length.
 
 A run is a loop over attempts, whose body solves one step, whole or a part: one program
 solves them all. Reverse mode cannot differentiate such a loop. Its derivatives are those of
-a whole step, and of a scan over the parts behind a condition.
+a whole step, and of a scan over the parts behind a condition. This doubles the program of a
+derivative, so that steps are divided in derivatives only if the user has asked for it.
 """
 
 from typing import Any
@@ -83,9 +84,11 @@ def solve_or_divide(
     """The solved step, and how often it was halved.
 
     By default a step of a large system may be halved three times, and that of a small
-    system not at all. Where the chord method is alone, a step that it cannot solve fails.
+    system not at all. Then derivatives are those of whole steps, and a step that fails as a
+    whole fails in them. Where the chord method is alone, a step that it cannot solve fails.
     """
     step = _Step(scheme, model, start, h, memory, root_finder, skip)
+    asked_for = max_halvings is not None
     if max_halvings is None:
         is_large = num_unknowns(memory) > SMALL
         max_halvings = _HALVINGS_OF_LARGE_SYSTEMS if is_large else 0
@@ -93,7 +96,7 @@ def solve_or_divide(
         max_halvings = 0
     if max_halvings == 0:
         return step.solve(), jnp.array(0)
-    return _solve_or_divide(step, max_halvings)
+    return _solve_or_divide(step, max_halvings, asked_for)
 
 
 class _Attempts(eqx.Module):
@@ -117,7 +120,9 @@ class _Attempts(eqx.Module):
 
 
 @eqx.filter_custom_jvp
-def _solve_or_divide(step: _Step, max_halvings: int) -> tuple[Solved, Count]:
+def _solve_or_divide(
+    step: _Step, max_halvings: int, asked_for: bool
+) -> tuple[Solved, Count]:
     wait = None if step.memory.chord_wait is None else jnp.array(_NO_CHORD)
 
     def attempt(before: _Attempts) -> _Attempts:
@@ -153,9 +158,14 @@ def _solve_or_divide(step: _Step, max_halvings: int) -> tuple[Solved, Count]:
 
 @_solve_or_divide.def_jvp
 def _solve_or_divide_jvp(primals: Any, tangents: Any) -> Any:
-    """The derivatives of a whole step and, if it has failed, of its parts."""
-    (step, max_halvings), (t_step, _) = primals, tangents
-    in_parts = lambda step: _solve_and_divide(step, max_halvings)
+    """The derivatives of a whole step and, if it has failed and may, of its parts."""
+    (step, max_halvings, asked_for), (t_step, *_) = primals, tangents
+
+    def in_parts(step: _Step) -> tuple[Solved, Count]:
+        if not asked_for:
+            return step.solve(), jnp.array(0)
+        return _solve_and_divide(step, max_halvings)
+
     return eqx.filter_jvp(in_parts, (step,), (t_step,))
 
 
@@ -246,7 +256,8 @@ def _with_memory_after(step: _Step, done: Solved, count: Scalar) -> Solved:
 def _begun(step: _Step, state: State, h: Scalar) -> Memory:
     """The memory of a scheme that begins at a state."""
     model = step.model
-    return first_memory(step.scheme, model, state, h, *model.accelerations(state))
+    now = model.accelerations(state)
+    return first_memory(step.scheme, model, state, h, *now, step.root_finder)
 
 
 def _at_time(state: State, start: State, passed: Scalar) -> State:

@@ -83,8 +83,10 @@ def simulate(
       used too.
     - `max_halvings`: a failed step is repeated as 2, 4, up to `2 ** max_halvings` equal
       steps, for which the energy identity holds as well; 0 disables this. The default is 3
-      for systems with many unknowns, else 0, because it lengthens the compilation.
-      `stats.halvings` shows where steps were divided.
+      for systems with many unknowns, else 0, because it lengthens the compilation. In
+      derivatives, whose compilation it doubles, the default is 0: there a step that would
+      be divided fails, unless you give a number. `stats.halvings` shows where steps were
+      divided.
     - `events`: an `Event`, an `Impact`, or a list of them: zeros of functions of the state,
       at which a step ends exactly, and after which the state may be another one. They are
       listed in `Solution.events`, after those of the system. Every zero is found at

@@ -40,8 +40,8 @@ from .prediction import extrapolated, Memory, memory_after, predicted
 
 # Enough for the linear convergence of a step that locks. A step that needs more has failed.
 MAX_ITERATIONS = 50
-# Up to this number of unknowns Newton's method is about as fast as the chord method in
-# short steps, and faster in long ones, where the chord method needs more corrections.
+# Up to this number of unknowns programs with Newton's method have no chord method beside
+# it: it would make them longer and no faster.
 _FEW = 16
 
 
@@ -72,6 +72,7 @@ def first_memory(
     h: Scalar,
     acceleration: Velocities,
     multipliers: Multipliers,
+    root_finder: RootFinder | ChordAlone,
 ) -> Memory:
     """The memory at the start of a run."""
     carried = None
@@ -83,8 +84,9 @@ def first_memory(
     added = jax.tree.map(lambda x, x0: jnp.stack([x - x0] * 3), z, flight)
     added = jax.lax.stop_gradient(added)
     flat, _ = ravel_pytree(flight)
+    alone = isinstance(root_finder, ChordAlone) and root_finder.in_small_systems
     has_chord = (
-        flat.size > _FEW
+        (flat.size > _FEW or alone)
         and isinstance(scheme, AbstractSchemeWithChord)
         and model.has_delassus_matrix
     )

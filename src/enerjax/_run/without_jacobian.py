@@ -21,7 +21,11 @@ from .._results import RESULTS
 from .._solvers import ChordAlone, Newton
 from .._system import System
 from .._types import Flag, Scalar
-from ..schemes import AbstractSchemeWithChord
+from ..schemes import (
+    AbstractOneSolveScheme,
+    AbstractSchemeWithChord,
+    AbstractSchemeWithRotations,
+)
 from .step import model_for
 from .step_sizes import EqualPlan
 from .task import Task
@@ -59,7 +63,15 @@ def chord_alone(task: Task) -> Task | None:
         experience.needs_jacobian = bool(_is_stiff(task))
     if experience.needs_jacobian:
         return None
-    return dataclasses.replace(task, root_finder=ChordAlone(newton))
+    return dataclasses.replace(task, root_finder=without_newton(newton, stage))
+
+
+def without_newton(newton: Newton, stage: AbstractOneSolveScheme) -> ChordAlone:
+    """The search of a run without the exact Jacobian."""
+    # Newton's method evaluates the equations less often than the chord method. Those of
+    # `EnergyConsistent` take so long that Newton's method is faster in small systems.
+    is_short = isinstance(stage, AbstractSchemeWithRotations)
+    return ChordAlone(newton, in_small_systems=is_short)
 
 
 def needs_jacobian(task: Task, result: RESULTS) -> bool:

@@ -10,9 +10,10 @@ from .._operators import AbstractModel, Increment, SeparableModel
 from .._programs import num_operations, simplified, why_not_one_function
 from .._run.inputs import prepare
 from .._run.loop import Stepper
-from .._run.stage import free_flight, step_problem
+from .._run.stage import free_flight, is_chord_alone, step_problem
 from .._run.step import model_for
 from .._run.step_sizes import End, EqualSteps
+from .._run.without_jacobian import without_newton
 from .._solvers import flattened, linearisable, Newton, RootFinder, SMALL
 from .._system import AbstractSystem, State
 from .._types import Args, Scalar
@@ -26,7 +27,8 @@ class Explanation:
     - `coordinates`: how the coordinates move.
     - `solves`: the number of solves in a step.
     - `unknowns`: the number of unknowns of a solve, by what they are.
-    - `method`: how they are searched for.
+    - `method`: how they are searched for. Inside of `jit` and other transformations
+      programs always have Newton's method, in small systems that alone.
     - `chord`: how the matrix `B M^-1 B^T` of the constraints is eliminated; `None` where
       the chord method is not used.
     - `jacobian`: how the exact Jacobian is stored and eliminated.
@@ -105,10 +107,13 @@ def _explained(
     root_finder: RootFinder,
 ) -> Explanation:
     plan = EqualSteps().plan(scheme, h, jnp.zeros_like(h), End(num_steps=1))
-    stepper = Stepper(scheme, model, plan, root_finder, None)
+    search = root_finder
+    if isinstance(root_finder, Newton) and root_finder.linear_solver is None:
+        search = without_newton(root_finder, scheme.stage)
+    stepper = Stepper(scheme, model, plan, search, None)
     begin = stepper.begin(start)
     memory = jax.tree.map(lambda x: x[0], begin.warm.stages)
-    by_chord = memory.chord_wait is not None and _chooses_itself(root_finder)
+    by_chord = is_chord_alone(search, memory)
     step = lambda progress: stepper.attempt(progress, jnp.array(True))
     problem = step_problem(scheme.stage, model, start, h, memory.carried)
     z = free_flight(scheme.stage, problem, model, start)
@@ -130,7 +135,7 @@ def _explained(
         coordinates=_coordinates(model, start),
         solves=len(scheme.stages),
         unknowns=_unknowns(z),
-        method=f"chord method; where that fails, {newton}" if by_chord else newton,
+        method=_BY_CHORD.format(newton) if by_chord else newton,
         chord=_chord(model) if by_chord else None,
         jacobian=jacobian,
         obstacles=why_not_one_function(step, begin),
@@ -140,14 +145,12 @@ def _explained(
     )
 
 
+_BY_CHORD = "chord method, without the exact Jacobian; if that fails in a step, {}"
+
+
 def _equations(z: Any, args: Any) -> Any:
     stage, problem = args
     return stage.residual(z, problem)
-
-
-def _chooses_itself(root_finder: RootFinder) -> bool:
-    """Whether the linear algebra is that of this library."""
-    return isinstance(root_finder, Newton) and root_finder.linear_solver is None
 
 
 def _coordinates(model: AbstractModel, start: State) -> str:

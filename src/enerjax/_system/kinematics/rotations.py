@@ -30,6 +30,7 @@ from ..._types import Coordinates, Increments, Velocities
 from .base import AbstractKinematics
 from .rigid_bodies import RigidBodies
 from .vectors import (
+    all_in_axes,
     cross,
     dot,
     in_axes,
@@ -136,7 +137,8 @@ class RigidKinematics(AbstractKinematics):
         half = 0.5 * turned
         once = rates_of_directors(axes, half)
         twice = rates_of_directors(once, half)
-        change = 2 / (1 + dot(half, half)) * (once + twice)
+        factor = 2 / (1 + dot(half, half))
+        change = factor[None, None] * (once + twice)
         return bodies.coordinates((moved, change), bodies.other_rates(step))
 
     def pull_back(self, qa, qb, gradient):
@@ -165,7 +167,8 @@ class RigidKinematics(AbstractKinematics):
         half = 0.5 * bodies.vectors(step)[1]
         end = bodies.vectors(mean + 0.5 * change)[1]
         once = cross(half, end)
-        rotated = 2 / (1 + dot(half, half)) * (once + cross(half, once))
+        factor = 2 / (1 + dot(half, half))
+        rotated = factor[None] * (once + cross(half, once))
         return change + self._rotational(rotated, qa)
 
     def gyroscopic(self, q, momentum, rates, args):
@@ -197,7 +200,7 @@ class RigidKinematics(AbstractKinematics):
         moved, of_rates = bodies.pose(0.5 * (by_a + by_b))
         half = 0.5 * bodies.vectors(step)[1]
         # In body axes `Rm^-1 S_i` is `y_i - t x y_i` with `y_i = R_a^T S_i`.
-        y = in_axes(axes, of_rates)
+        y = all_in_axes(axes, of_rates)
         z = y - cross(half[None], y)
         skew = z - jnp.swapaxes(z, 0, 1)
         spin = jnp.stack([skew[1, 2], skew[2, 0], skew[0, 1]])

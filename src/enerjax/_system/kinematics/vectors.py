@@ -33,9 +33,14 @@ def sum_of_products(a: Axes, b: Axes) -> Vector3:
     return jnp.sum(cross(a, b), axis=0)
 
 
-def in_axes(axes: Axes, vectors: Float[Array, "*n 3 bodies"]) -> Array:
-    """The components of vectors in body axes."""
-    return jnp.sum(axes * vectors[..., None, :, :], axis=-2)
+def in_axes(axes: Axes, vector: Vector3) -> Vector3:
+    """The components of a vector in body axes."""
+    return jnp.sum(axes * vector[None], axis=1)
+
+
+def all_in_axes(axes: Axes, vectors: Axes) -> Axes:
+    """The components of three vectors in body axes."""
+    return jnp.sum(axes[None] * vectors[:, None], axis=2)
 
 
 def rates_of_directors(axes: Axes, spin: Vector3) -> Axes:
