@@ -3,7 +3,7 @@
     python benchmarks/portfolio.py [--out FOLDER] [--quick] [--only WORK ...]
 
 The works are in `portfolio_works.py`: bodies in space and in the plane, points, tops, and
-systems in angles, with `enable_fast_loops()`, beside EXUDYN (the generalized-alpha method),
+systems in angles, with default settings, beside EXUDYN (the generalized-alpha method),
 MuJoCo (Runge-Kutta in the coordinates of the joints) and diffrax (Tsit5 on our model) where
 they can do the same work (extra `peers`). Each program does each work in a process of its
 own, so that the first call and the memory are its own. All are on one core, and take turns:

@@ -273,6 +273,15 @@ def test_a_run_that_needs_newton_is_made_again_with_it_once(searched_by):
     np.testing.assert_allclose(sol.ys.q, both.ys.q, rtol=0, atol=1e-11)
 
 
+def test_residuals_of_two_levels_may_shrink_in_turn(searched_by):
+    """In a slider-crank a correction can leave most of a residual, the next one little."""
+    system, start, args = ej.problems.slider_crank()
+    sol = ej.simulate(system, ej.EnergyPreserving(), start, args, h=1e-3, num_steps=200)
+    assert searched_by == ["ChordAlone"]
+    # Solver: round-off of 200 steps.
+    assert jnp.max(jnp.abs(sol.audit.leak)) <= 1e3 * EPS * jnp.max(sol.audit.kinetic)
+
+
 @pytest.mark.parametrize("damped", [False, True])
 def test_stiff_forces_are_noticed_before_the_first_program(searched_by, damped):
     """A row of points on springs, or in dampers, of ten radians a step."""
@@ -291,6 +300,23 @@ def test_stiff_forces_are_noticed_before_the_first_program(searched_by, damped):
     assert searched_by == ["Newton"]
 
 
+@pytest.mark.parametrize("transform", [jax.vmap, jax.grad], ids=["vmap", "grad"])
+def test_a_traced_number_in_a_closure_is_noticed(searched_by, transform):
+    def run(length):
+        system = ej.System(
+            jnp.eye(2),
+            lambda q, args: 9.81 * q[1],
+            lambda q, args: jnp.array([q @ q - length**2]),
+        )
+        start = ej.State(jnp.array([length, 0.0]), jnp.zeros(2))
+        sol = ej.simulate(system, ej.EnergyPreserving(), start, h=0.01, num_steps=5)
+        return sol.ys.q[-1, 1]
+
+    found = transform(run)(jnp.array([1.0, 2.0]) if transform is jax.vmap else 1.0)
+    assert jnp.all(jnp.isfinite(found))
+    assert set(searched_by) == {"Newton"}
+
+
 def test_a_failure_that_newton_cannot_mend_is_made_once(searched_by):
     system, start, args = ej.problems.chain(8)
     off = ej.State(start.q * 1.1, start.v)
@@ -299,3 +325,17 @@ def test_a_failure_that_newton_cannot_mend_is_made_once(searched_by):
     )
     assert sol.result == ej.RESULTS.inconsistent_start
     assert len(searched_by) == 1
+
+
+def test_a_run_that_fails_in_both_ways_is_forgotten(searched_by):
+    system, start, args = ej.problems.double_pendulum()
+
+    def run(h):
+        searched_by.clear()
+        ej.simulate(
+            system, ej.EnergyPreserving(), start, args, h=h, num_steps=8, throw=False
+        )
+        return list(searched_by)
+
+    assert run(5.0) == ["ChordAlone", "Newton"]
+    assert run(1e-3) == ["ChordAlone"]

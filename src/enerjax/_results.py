@@ -17,7 +17,8 @@ class RESULTS(eqx.Enumeration):
     not_converged = (
         "Newton's method did not converge. The step may be too long for the motion: "
         "reduce `h`, let failed steps be divided (`max_halvings=4`), or let a "
-        "`StepController` choose the steps. Vibrations of stiff springs that no step can "
+        "`StepController` choose the steps. In derivatives steps are divided only if "
+        "`max_halvings` is given. Vibrations of stiff springs that no step can "
         "resolve are damped by `EnergyConsistent(1.0)` or `EnergyDecaying(1.0)`."
     )
     singular = (

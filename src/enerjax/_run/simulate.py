@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from .._programs import at_top_level, compiled
 from .._progress import Progress
+from .._results import RESULTS
 from .._solvers import Newton, RootFinder
 from .._system import AbstractSystem, State
 from .._types import Args, Real, Scalar
@@ -22,7 +23,7 @@ from .stage import is_chord_alone
 from .step_sizes import AbstractController, EqualSteps, find_end
 from .task import Task
 from .watcher import watcher_of
-from .without_jacobian import chord_alone, needs_jacobian
+from .without_jacobian import chord_alone, may_need_newton, remember_newton
 
 
 def simulate(
@@ -110,6 +111,11 @@ def simulate(
       the cause (under `jit`, `vmap` and `grad` only the cause, and for all lanes at once).
       With `False` check `result`: rows after the failure are NaN.
 
+    A run with equal steps outside of `jit` and other transformations is first made without
+    Newton's method, whose program compiles for longer. If a step needs it, the run is made
+    again from its start, and `saveat.fn` is evaluated again. Later runs of the system then
+    have Newton's method from the beginning; they agree to round-off.
+
     With `progress`, `checkpoint` or `resume` a run is made piece by piece. Its program is
     another one than that of a plain run, with which it agrees to round-off; among such runs
     equal steps are equal to the last bit. Ctrl-C then ends it after the current piece, in
@@ -169,8 +175,10 @@ def _whole(task: Task, num_rows: int) -> tuple[Solution, Scalar]:
             task = dataclasses.replace(task, plan=task.plan.rounded_up())
         quick = chord_alone(task)
     solution, reached, alone = _run(task if quick is None else quick)
-    if alone and needs_jacobian(task, solution.result):
+    if alone and may_need_newton(solution.result):
         solution, reached, _ = _run(task)
+        if bool(solution.result == RESULTS.successful):
+            remember_newton(task)
     if solution.ts.size > num_rows:
         solution = first_rows(solution, num_rows)
     return solution, reached

@@ -233,14 +233,16 @@ def _solved(
     """The result of a step whose search has ended with `root`."""
     z = jax.tree.map(jnp.multiply, root.value, prepared.unknown_scale)
     end = scheme.finish(z, problem)
-    reverses, no = lambda: _gradients_reverse(model, start, end.state), jnp.array(False)
-    if memory.chord_wait is not None:
-        # Where the chord method converges, the gradients have hardly changed.
-        alone, by_newton = is_chord_alone(root_finder, memory), reverses
-        reverses = lambda: (
-            no if alone else jax.lax.cond(root.by_chord, lambda: no, by_newton)
-        )
-    branch = RESULTS.where(reverses(), RESULTS.step_too_large, RESULTS.successful)
+    tests = lambda: _gradients_reverse(model, start, end.state)
+    no = jnp.array(False)
+    # Where the chord method converges in a large system, the gradients have hardly changed.
+    if memory.chord_wait is None or num_unknowns(memory) <= _FEW:
+        reverses = tests()
+    elif is_chord_alone(root_finder, memory):
+        reverses = no
+    else:
+        reverses = jax.lax.cond(root.by_chord, lambda: no, tests)
+    branch = RESULTS.where(reverses, RESULTS.step_too_large, RESULTS.successful)
     found = from_root_finder(root.found, root.broken, root.finite)
     added = jax.lax.stop_gradient(jax.tree.map(jnp.subtract, z, prepared.flight))
     sizes = model.scales.step, added, memory.added, prepared.unknown_scale

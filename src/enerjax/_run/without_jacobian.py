@@ -1,26 +1,26 @@
 """Runs whose program has no exact Jacobian, which smooth motion does not need.
 
-The exact Jacobian, for which Newton's method calls, is more than half of the program of a
-run by the chord method, and of the time of its compilation: a slider-crank compiles in 9 s
-without it and in 25 s with it, and two hinged bodies take 10 us a step instead of 21 us,
-because the shorter step fits into one function. A run at the top level is therefore made
-without it first. If the chord method fails in a step, the run is made again with Newton's
-method behind it, and so are all later runs of the system.
+The exact Jacobian, which Newton's method needs, is more than half of the program of a run,
+and of the time of its compilation: a slider-crank compiles in 9 s without it and in 25 s
+with it. A run at the top level is therefore first made by the chord method alone. If that
+fails in a step, the run is made again with Newton's method too, and if this helps, so are
+all later runs of the system.
 """
 
 import dataclasses
 import functools
 from collections.abc import Hashable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from .._operators import SeparableModel
-from .._programs import compiled_for_once, jacobian_pattern, structure_of
+from .._programs import compiled_for_once, is_known, jacobian_pattern, structure_of
 from .._results import RESULTS
 from .._solvers import ChordAlone, Newton
-from .._system import System
-from .._types import Flag, Scalar
+from .._system import State, System
+from .._types import Scalar
 from ..schemes import (
     AbstractOneSolveScheme,
     AbstractSchemeWithChord,
@@ -31,24 +31,34 @@ from .step_sizes import EqualPlan
 from .task import Task
 
 
-# A run whose chord method would leave more than this part of an error in a correction is
-# made with Newton's method at once: the chord method fails there.
+# The largest contraction, the fraction of an error that a correction leaves, for which the
+# chord method is tried alone.
 _CONTRACTS = 0.25
-# The estimate needs no digits.
+# The passes of the power iteration; the estimate needs no digits.
 _PASSES = 10
-# The failures of a step that Newton's method may solve.
-_OF_SEARCH = (RESULTS.not_converged, RESULTS.singular, RESULTS.nonfinite)
+# The failures of a step that Newton's method may mend.
+_OF_SEARCH = (
+    RESULTS.not_converged,
+    RESULTS.singular,
+    RESULTS.nonfinite,
+    RESULTS.step_too_large,
+)
 
 
 @dataclasses.dataclass
 class _Experience:
-    """What is known of the systems of one structure: whether they need the Jacobian."""
+    """What is known of the systems of one structure.
 
-    needs_jacobian: bool | None = None
+    - `is_linear`: whether all forces are constant; `None` before the first run.
+    - `needs_newton`: whether a run has failed without Newton's method, and not with it.
+    """
+
+    is_linear: bool | None = None
+    needs_newton: bool = False
 
 
 def chord_alone(task: Task) -> Task | None:
-    """The same run in a program without the exact Jacobian; `None` if it would fail."""
+    """The same run in a program without the exact Jacobian, if that is worth a try."""
     newton, stage, system = task.root_finder, task.scheme.stage, task.system
     if (
         not (isinstance(newton, Newton) and newton.linear_solver is None)
@@ -56,12 +66,18 @@ def chord_alone(task: Task) -> Task | None:
         or not isinstance(task.plan, EqualPlan)
         or task.watcher is not None
         or system.redundant
+        or (system.constraint is None and system.driven is None)
     ):
         return None
     experience = _experience(task)
-    if experience.needs_jacobian is None:
-        experience.needs_jacobian = bool(_is_stiff(task))
-    if experience.needs_jacobian:
+    if experience.needs_newton:
+        return None
+    if experience.is_linear is None:
+        if _closes_over_traced_values(system, task):
+            return None
+        experience.is_linear = _is_linear(system, task)
+    # NaN compares false: such a run fails in any program.
+    if not experience.is_linear and bool(_contraction(task) > _CONTRACTS):
         return None
     return dataclasses.replace(task, root_finder=without_newton(newton, stage))
 
@@ -74,17 +90,18 @@ def without_newton(newton: Newton, stage: AbstractOneSolveScheme) -> ChordAlone:
     return ChordAlone(newton, in_small_systems=is_short)
 
 
-def needs_jacobian(task: Task, result: RESULTS) -> bool:
-    """Whether the run without a Jacobian failed for its lack, which is remembered."""
-    if not any(bool(result == failure) for failure in _OF_SEARCH):
-        return False
-    _experience(task).needs_jacobian = True
-    return True
+def may_need_newton(result: RESULTS) -> bool:
+    """Whether a run with this result may have failed for want of Newton's method."""
+    return any(bool(result == failure) for failure in _OF_SEARCH)
+
+
+def remember_newton(task: Task) -> None:
+    """Later runs of the system have Newton's method from the beginning."""
+    _experience(task).needs_newton = True
 
 
 def _experience(task: Task) -> _Experience:
-    key = task.system, task.scheme, task.start, task.args
-    structure = structure_of(key)
+    structure = structure_of((task.system, task.scheme, task.start, task.args))
     return _Experience() if structure is None else _remembered(structure)
 
 
@@ -93,22 +110,41 @@ def _remembered(structure: Hashable) -> _Experience:
     return _Experience()
 
 
-def _is_stiff(task: Task) -> Flag | bool:
-    """Whether forces are so stiff that the chord method, which omits them, fails."""
-    system, args = task.system, task.args
-    assert isinstance(system, System)
-    if system.force is None:
-        slope = jax.grad(lambda q: system.potential(q, args))
-        pattern = jacobian_pattern(slope, task.start.q)
-        if pattern is not None and pattern.nnz == 0:
-            return False
-    # NaN compares false: such a run fails in any program.
-    return _contraction(task) > _CONTRACTS
+def _closes_over_traced_values(system: System, task: Task) -> bool:
+    """Whether a function of the system has a traced value in its closure.
+
+    The result of such a run is traced, so it cannot be known whether the run has failed.
+    """
+    start, args = task.start, task.args
+    t = jnp.zeros((), start.q.dtype)
+
+    def values(q: jax.Array, v: jax.Array) -> Any:
+        found = [system.kinetic_energy(State(q, v), args), system.potential(q, args)]
+        if system.constraint is not None:
+            found.append(system.constraint(q, args))
+        if system.driven is not None:
+            found.append(system.driven(q, t, args))
+        if system.force is not None:
+            found.append(system.force(q, v, t, args))
+        if system.nonholonomic is not None:
+            found.append(system.nonholonomic(q, args))
+        return found
+
+    return not is_known(jax.make_jaxpr(values)(start.q, start.v).consts)
+
+
+def _is_linear(system: System, task: Task) -> bool:
+    """Whether there is no force but constant ones, such as gravity."""
+    if system.force is not None:
+        return False
+    slope = jax.grad(lambda q: system.potential(q, task.args))
+    pattern = jacobian_pattern(slope, task.start.q)
+    return pattern is not None and pattern.nnz == 0
 
 
 @compiled_for_once
 def _contraction(task: Task) -> Scalar:
-    """The part of an error that a correction of the chord method leaves, at the start.
+    """An estimate, at the start, of the contraction of the chord method by stiff forces.
 
     It is the spectral radius of `h^2/4 M^-1 K + h/2 M^-1 D` with the stiffness and damping
     of the forces, by power iteration.

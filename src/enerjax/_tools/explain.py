@@ -27,8 +27,9 @@ class Explanation:
     - `coordinates`: how the coordinates move.
     - `solves`: the number of solves in a step.
     - `unknowns`: the number of unknowns of a solve, by what they are.
-    - `method`: how they are searched for. Inside of `jit` and other transformations
-      programs always have Newton's method, in small systems that alone.
+    - `method`: how they are searched for. Programs have Newton's method from the beginning,
+      and in small systems that alone, where forces are stiff, with events, with a
+      `StepController`, and inside of `jit` and other transformations.
     - `chord`: how the matrix `B M^-1 B^T` of the constraints is eliminated; `None` where
       the chord method is not used.
     - `jacobian`: how the exact Jacobian is stored and eliminated.

@@ -27,11 +27,11 @@ def why_not_one_function(
 
     closed = jax.make_jaxpr(fn)(*args)
     known = [*map(as_index, closed.consts), *[None] * len(closed.jaxpr.invars)]
-    if Program(closed.jaxpr, known, 0).is_possible:
+    if Program(closed.jaxpr, known).is_possible:
         return ()
     length = num_equations(closed.jaxpr)
     if length > longest(closed.jaxpr):
-        parts = "; its parts are functions" if has_parts(closed.jaxpr) else ""
+        parts = "; its parts are compiled apart" if has_parts(closed.jaxpr) else ""
         reason = f"its length, {length} array operations, which would compile slowly"
         return (reason + parts,)
     names = {_name(x[-1]) for x in obstacles(rewritten(closed.jaxpr, known).jaxpr)}

@@ -26,12 +26,11 @@ from ..primitives import (
 # XLA calls a library for sums of more entries; this limit leaves a margin.
 LARGEST_SUM = 2048
 # The largest number of array operations of one function. The time of its compilation grows
-# faster than its length: as one function two hinged bodies in space (9000 operations) would
-# compile in 36 s instead of 18 s, and their steps would take 15 us instead of 18 us.
+# faster than its length.
 LARGEST_PROGRAM = 8_700
-# The same for a program that can also be one function for each of its parts. The time of
-# its steps is then a fifth longer: two hinged bodies take 13.5 us a step and compile in
-# 11 s (11.6 us and 25 s as one function).
+# The same for a program whose parts can be functions. Parts compile in less time, and their
+# steps take a fifth longer: with Newton's method two hinged bodies compile in 11 s in parts
+# and in 25 s as one function, and take 13.5 us a step and 11.6 us.
 LARGEST_OF_PARTS = 2_600
 # XLA calls a library for products of matrices with as many rows and columns.
 _FEW = 8

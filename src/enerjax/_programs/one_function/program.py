@@ -34,8 +34,8 @@ class Program:
     - `jaxpr`: its constants are passed as the first inputs. They can be traced, and a
       program that held them would outlive their trace.
     - `known`: the values of those inputs that are known indices; `None` for the others.
-    - `is_part`: whether the program is a part of one that may be one function as a whole.
-      The part is then no function of its own.
+    - `is_part`: whether the program is a part of a larger one. If the larger one is one
+      function, the part is not a function of its own.
     - `linear`: the number of inputs, the last ones, that the program is linear in.
     """
 
