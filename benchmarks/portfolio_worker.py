@@ -59,15 +59,15 @@ def _first_call(fn: Callable, *args: Any) -> tuple[Any, Any, Record]:
 
 def _first_run(run: Callable[[], Any]) -> Record:
     """What the first call of a run costs that is not inside of `jit`."""
-    spent = dict.fromkeys(("lower_s", "xla_s"), 0.0)
+    spent: dict[str, float] = {"lower_s": 0.0, "xla_s": 0.0}
     events = {
         "/jax/core/compile/jaxpr_to_mlir_module_duration": "lower_s",
         "/jax/core/compile/backend_compile_duration": "xla_s",
     }
 
-    def listen(event: str, seconds: float, **_: Any) -> None:
+    def listen(event: str, duration_secs: float, **_: Any) -> None:
         if event in events:
-            spent[events[event]] += seconds
+            spent[events[event]] += duration_secs
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     times = [harness.clock()]

@@ -256,8 +256,7 @@ def _with_memory_after(step: _Step, done: Solved, count: Scalar) -> Solved:
 def _begun(step: _Step, state: State, h: Scalar) -> Memory:
     """The memory of a scheme that begins at a state."""
     model = step.model
-    now = model.accelerations(state)
-    return first_memory(step.scheme, model, state, h, *now, step.root_finder)
+    return first_memory(step.scheme, model, state, h, *model.accelerations(state))
 
 
 def _at_time(state: State, start: State, passed: Scalar) -> State:

@@ -72,9 +72,7 @@ class Stepper(eqx.Module):
         acceleration, multipliers = model.accelerations(start)
         return Progress(
             state=State(start.q, start.v),
-            warm=first_warm(
-                scheme, model, start, h, acceleration, multipliers, self.root_finder
-            ),
+            warm=first_warm(scheme, model, start, h, acceleration, multipliers),
             place=place,
             memory=plan.begin(model.in_rates, model.to_rates(timed)),
             result=result,

@@ -40,8 +40,9 @@ from .prediction import extrapolated, Memory, memory_after, predicted
 
 # Enough for the linear convergence of a step that locks. A step that needs more has failed.
 MAX_ITERATIONS = 50
-# Up to this number of unknowns programs with Newton's method have no chord method beside
-# it: it would make them longer and no faster.
+# Up to this number of unknowns Newton's method is about as fast as the chord method in
+# short steps, and faster in long ones, where the chord method needs more corrections. It
+# also resolves a light, slow body beside a heavy, fast one.
 _FEW = 16
 
 
@@ -72,7 +73,6 @@ def first_memory(
     h: Scalar,
     acceleration: Velocities,
     multipliers: Multipliers,
-    root_finder: RootFinder | ChordAlone,
 ) -> Memory:
     """The memory at the start of a run."""
     carried = None
@@ -84,9 +84,8 @@ def first_memory(
     added = jax.tree.map(lambda x, x0: jnp.stack([x - x0] * 3), z, flight)
     added = jax.lax.stop_gradient(added)
     flat, _ = ravel_pytree(flight)
-    alone = isinstance(root_finder, ChordAlone) and root_finder.in_small_systems
     has_chord = (
-        (flat.size > _FEW or alone)
+        flat.size > _FEW
         and isinstance(scheme, AbstractSchemeWithChord)
         and model.has_delassus_matrix
     )
@@ -235,8 +234,8 @@ def _solved(
     end = scheme.finish(z, problem)
     tests = lambda: _gradients_reverse(model, start, end.state)
     no = jnp.array(False)
-    # Where the chord method converges in a large system, the gradients have hardly changed.
-    if memory.chord_wait is None or num_unknowns(memory) <= _FEW:
+    # Where the chord method converges, the gradients have hardly changed.
+    if memory.chord_wait is None:
         reverses = tests()
     elif is_chord_alone(root_finder, memory):
         reverses = no

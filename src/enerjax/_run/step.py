@@ -80,13 +80,12 @@ def first_warm(
     h: Scalar,
     acceleration: Velocities,
     multipliers: Multipliers,
-    root_finder: RootFinder | ChordAlone,
 ) -> Warm:
     """The memory at the start of a run, where every stage is predicted from the start."""
 
     def first(length):
         return first_memory(
-            scheme.stage, model, start, length * h, acceleration, multipliers, root_finder
+            scheme.stage, model, start, length * h, acceleration, multipliers
         )
 
     lengths = jnp.asarray(scheme.stages, h.dtype)
@@ -157,9 +156,7 @@ def _sum_and_rest(x: Array, y: Array) -> tuple[Array, Array]:
 def _single_step(system, scheme, state, args, h, warm, root_finder, max_halvings):
     model = model_for(scheme, system, state, args)
     state = model.to_internal(state)
-    fresh = lambda: first_warm(
-        scheme, model, state, h, *model.accelerations(state), root_finder
-    )
+    fresh = lambda: first_warm(scheme, model, state, h, *model.accelerations(state))
     if warm is None:
         warm = fresh()
     elif _types(warm) != _types(eqx.filter_eval_shape(fresh)):

@@ -21,11 +21,7 @@ from .._results import RESULTS
 from .._solvers import ChordAlone, Newton
 from .._system import State, System
 from .._types import Scalar
-from ..schemes import (
-    AbstractOneSolveScheme,
-    AbstractSchemeWithChord,
-    AbstractSchemeWithRotations,
-)
+from ..schemes import AbstractSchemeWithChord
 from .step import model_for
 from .step_sizes import EqualPlan
 from .task import Task
@@ -79,15 +75,7 @@ def chord_alone(task: Task) -> Task | None:
     # NaN compares false: such a run fails in any program.
     if not experience.is_linear and bool(_contraction(task) > _CONTRACTS):
         return None
-    return dataclasses.replace(task, root_finder=without_newton(newton, stage))
-
-
-def without_newton(newton: Newton, stage: AbstractOneSolveScheme) -> ChordAlone:
-    """The search of a run without the exact Jacobian."""
-    # Newton's method evaluates the equations less often than the chord method. Those of
-    # `EnergyConsistent` take so long that Newton's method is faster in small systems.
-    is_short = isinstance(stage, AbstractSchemeWithRotations)
-    return ChordAlone(newton, in_small_systems=is_short)
+    return dataclasses.replace(task, root_finder=ChordAlone(newton))
 
 
 def may_need_newton(result: RESULTS) -> bool:

@@ -82,11 +82,9 @@ class ChordAlone(eqx.Module):
 
     The exact Jacobian is more than half of the program of a step, and smooth motion does
     not need it. `newton` has the tolerances; it searches where there is no chord method.
-    With `in_small_systems` these have one too.
     """
 
     newton: Newton
-    in_small_systems: bool = eqx.field(static=True, default=False)
 
 
 class Start(eqx.Module):

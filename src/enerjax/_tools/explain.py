@@ -13,8 +13,7 @@ from .._run.loop import Stepper
 from .._run.stage import free_flight, is_chord_alone, step_problem
 from .._run.step import model_for
 from .._run.step_sizes import End, EqualSteps
-from .._run.without_jacobian import without_newton
-from .._solvers import flattened, linearisable, Newton, RootFinder, SMALL
+from .._solvers import ChordAlone, flattened, linearisable, Newton, RootFinder, SMALL
 from .._system import AbstractSystem, State
 from .._types import Args, Scalar
 from ..schemes import AbstractScheme
@@ -27,8 +26,8 @@ class Explanation:
     - `coordinates`: how the coordinates move.
     - `solves`: the number of solves in a step.
     - `unknowns`: the number of unknowns of a solve, by what they are.
-    - `method`: how they are searched for. Programs have Newton's method from the beginning,
-      and in small systems that alone, where forces are stiff, with events, with a
+    - `method`: how they are searched for. Beside a chord method programs have Newton's
+      method from the beginning where forces are stiff, with events, with a
       `StepController`, and inside of `jit` and other transformations.
     - `chord`: how the matrix `B M^-1 B^T` of the constraints is eliminated; `None` where
       the chord method is not used.
@@ -110,7 +109,7 @@ def _explained(
     plan = EqualSteps().plan(scheme, h, jnp.zeros_like(h), End(num_steps=1))
     search = root_finder
     if isinstance(root_finder, Newton) and root_finder.linear_solver is None:
-        search = without_newton(root_finder, scheme.stage)
+        search = ChordAlone(root_finder)
     stepper = Stepper(scheme, model, plan, search, None)
     begin = stepper.begin(start)
     memory = jax.tree.map(lambda x: x[0], begin.warm.stages)
