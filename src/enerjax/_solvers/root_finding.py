@@ -138,7 +138,7 @@ def search(
     def again() -> Root:
         # Under `vmap` this is evaluated for all lanes, also for those with a root.
         left = eqx.tree_at(lambda start: start.skip, start, start.skip | first.found)
-        last = part(lambda: _iterated(exact, root_finder, left, max_iterations))()
+        last = _iterated(exact, root_finder, left, max_iterations)
         last = eqx.tree_at(
             lambda root: root.iterations, last, last.iterations + first.iterations
         )
