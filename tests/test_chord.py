@@ -1,6 +1,7 @@
 """Chord iterations with inertia and constraints, and Newton's method where they fail."""
 
 import functools
+import sys
 from typing import Any
 
 import jax
@@ -12,6 +13,7 @@ from jax.flatten_util import ravel_pytree
 
 import enerjax as ej
 from enerjax._operators import SeparableModel
+from enerjax._run import without_jacobian
 from enerjax._solvers import Chord, find_root, Newton, schur, schur_tables
 from enerjax._solvers.linear.block_diagonal import in_blocks
 
@@ -238,8 +240,8 @@ def test_newton_follows_where_springs_are_too_stiff_for_the_chord():
 @pytest.fixture
 def searched_by(monkeypatch):
     """The root finders of the programs that runs have used, by name."""
-    import sys
-
+    # Without what other tests have shown of the same systems.
+    without_jacobian._remembered.cache_clear()
     module, names = sys.modules["enerjax._run.simulate"], []
     run = module._run
 
