@@ -84,8 +84,9 @@ def solve_or_divide(
     """The solved step, and how often it was halved.
 
     By default a step of a large system may be halved three times, and that of a small
-    system not at all. Then derivatives are those of whole steps, and a step that fails as a
-    whole fails in them. Where the chord method is alone, a step that it cannot solve fails.
+    system not at all. Derivatives by default do not divide steps: a step that would be
+    divided fails in them. Where the chord method is alone, a step that it cannot solve
+    fails.
     """
     step = _Step(scheme, model, start, h, memory, root_finder, skip)
     asked_for = max_halvings is not None
@@ -158,7 +159,8 @@ def _solve_or_divide(
 
 @_solve_or_divide.def_jvp
 def _solve_or_divide_jvp(primals: Any, tangents: Any) -> Any:
-    """The derivatives of a whole step and, if it has failed and may, of its parts."""
+    """The derivatives of a whole step. If it has failed and the user has asked for
+    halvings, they are those of its parts."""
     (step, max_halvings, asked_for), (t_step, *_) = primals, tangents
 
     def in_parts(step: _Step) -> tuple[Solved, Count]:

@@ -55,7 +55,7 @@ POSSIBLE_IF_SMALL = REDUCTIONS | LOGICAL_REDUCTIONS | PLACES_OF_EXTREMES
 
 
 def has_parts(jaxpr: Jaxpr) -> bool:
-    """Whether a program has parts that are to be functions if the whole cannot be one."""
+    """Whether a program has parts that become functions where the whole becomes none."""
     return any(
         is_part(eqn) or any(map(has_parts, programs_within(eqn))) for eqn in jaxpr.eqns
     )
