@@ -252,16 +252,21 @@ class SeparableModel(AbstractModel):
         mean_rate, torque = self._mean_rates(a, b, h, increment, is_step)
 
         constraint = lambda q: jnp.concatenate([self.fixed(q), self.coordinate(q)])
-        rate = lambda q: jax.jvp(self.fixed, (q,), (mean_rate(q),))[1]
+        # Both from one evaluation, which the transpose then passes once.
+        with_rate = lambda q: jax.jvp(constraint, (q,), (mean_rate(q),))
+        num_fixed = fixed.velocity_impulse.size
+        rate = lambda q: with_rate(q)[1][:num_fixed]
         slip_rate = lambda q: self.nonholonomic(q) @ mean_rate(q)
         has_slip_rate = self.has_slip_rate(nonholonomic)
 
         def action(q: Coordinates) -> Scalar:
             out = h * self._potential(q)
-            if fixed.impulse.size > 0:
+            if num_fixed > 0:
+                value, rates = with_rate(q)
+                out = out + h * fixed.velocity_impulse @ rates[:num_fixed]
+                out = out + fixed.impulse @ value
+            elif fixed.impulse.size > 0:
                 out = out + fixed.impulse @ constraint(q)
-            if fixed.velocity_impulse.size > 0:
-                out = out + h * fixed.velocity_impulse @ rate(q)
             if has_slip_rate:
                 out = out + h * nonholonomic.velocity_impulse @ slip_rate(q)
             return out
@@ -281,7 +286,7 @@ class SeparableModel(AbstractModel):
             return Gradient(impulse, none, work, torque)
         rows: list[Summands] = [lambda q, fn=fn: h * fn(q) for fn in energies]
         rows += [lambda q: fixed.impulse * constraint(q)]
-        if fixed.velocity_impulse.size > 0:
+        if num_fixed > 0:
             rows += [lambda q: h * fixed.velocity_impulse * rate(q)]
         if has_slip_rate:
             rows += [lambda q: h * nonholonomic.velocity_impulse * slip_rate(q)]

@@ -16,7 +16,11 @@ from jax.extend.core import Literal
 from jaxtyping import Array, PyTree
 
 from .compiled import is_hashable
-from .jaxprs import evaluate, interpret
+from .jaxprs import evaluate, interpret, is_known
+
+
+# Constants with more numbers than this are not compared.
+_MANY = 4096
 
 
 def simplified(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Array]]:
@@ -28,10 +32,28 @@ def simplified(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Array]]
         whole = lambda *leaves: fn(*eqx.combine(structure.unflatten(leaves), rest))
         closed, like = jax.make_jaxpr(whole, return_shape=True)(*leaves)
         rule = _Once(_needed(closed.jaxpr))
-        out = interpret(closed.jaxpr, closed.consts, leaves, rule)
+        out = interpret(closed.jaxpr, _shared(closed.consts), leaves, rule)
         return jax.tree.unflatten(jax.tree.structure(like), map(jnp.asarray, out))
 
     return call
+
+
+def _shared(constants: list[Any]) -> list[Any]:
+    """The constants of a program, with one array for all that are equal.
+
+    A function that is called twice brings two copies of its tables, and operations on them
+    would not be recognised as equal.
+    """
+    first: dict[Any, Any] = {}
+    return [first.setdefault(_content(x), x) for x in constants]
+
+
+def _content(constant: Any) -> Any:
+    """Equal for arrays of equal numbers; the identity of a traced or a large array."""
+    if not is_known(constant) or np.size(constant) > _MANY:
+        return id(constant)
+    array = np.asarray(constant)
+    return array.tobytes(), array.shape, array.dtype, jnp.asarray(constant).weak_type
 
 
 def _needed(jaxpr: Any) -> set[int]:

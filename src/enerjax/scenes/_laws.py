@@ -6,7 +6,7 @@ chain rule for difference quotients conserves energy and momenta to round-off.
 """
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
@@ -69,13 +69,22 @@ class Alignment(AbstractConstraintLaw):
         apart = offset(a, b, numbers)
         if not self.has_frames:
             return apart
-        of_a = [a.direction(numbers["frame_a"][k]) for k in range(apart.size)]
-        of_b = [b.direction(numbers["frame_b"][k]) for k in range(apart.size)]
         rows = [apart]
         if self.along is not None:
-            rows = [jnp.sum(apart * of_a[k])[None] for k in self.along]
-        rows += [jnp.sum(of_a[i] * of_b[j])[None] for i, j in self.square]
+            along = a.directions(_chosen(numbers["frame_a"], self.along))
+            rows = [jnp.sum(apart[None] * along, axis=1)]
+        if self.square:
+            i, j = zip(*self.square, strict=True)
+            of_a = a.directions(_chosen(numbers["frame_a"], i))
+            of_b = b.directions(_chosen(numbers["frame_b"], j))
+            rows.append(jnp.sum(of_a * of_b, axis=1))
         return jnp.concatenate(rows)
+
+
+def _chosen(frame: Array, axes: Sequence[int]) -> Array:
+    """Some axes of a frame, shape `(n, d)`; a single one if all are the same."""
+    chosen = axes[:1] if len(set(axes)) == 1 else axes
+    return jnp.stack([frame[k] for k in chosen])
 
 
 @dataclass(frozen=True)
