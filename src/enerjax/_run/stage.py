@@ -15,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from .._operators import AbstractModel, Increment, roughness, scales_like, shortened
-from .._programs import part
+from .._programs import part, simplified
 from .._results import first_failure, from_root_finder, RESULTS
 from .._solvers import (
     AbstractFactors,
@@ -135,7 +135,8 @@ def solve(
     # Steps by the chord method are the longest programs.
     has_parts = memory.chord_wait is not None and num_unknowns(memory) <= _MANY
     apart = part if has_parts else lambda fn: fn
-    prepared = apart(lambda: _prepared(scheme, problem, model, start, h, memory))()
+    prepare = simplified(lambda: _prepared(scheme, problem, model, start, h, memory))
+    prepared = apart(prepare)()
     unknown_scale, row_scale = prepared.unknown_scale, prepared.row_scale
 
     def scaled(x, inputs):
@@ -160,7 +161,7 @@ def solve(
         rarely=rarely or wait is not None,
     )
     step = scheme, problem, model, start, memory, prepared
-    return apart(lambda: _solved(*step, root, root_finder))()
+    return apart(simplified(lambda: _solved(*step, root, root_finder)))()
 
 
 def is_chord_alone(root_finder: RootFinder | ChordAlone, memory: Memory) -> bool:
