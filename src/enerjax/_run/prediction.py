@@ -1,5 +1,6 @@
 """The initial guesses of Newton's method, extrapolated from the last steps."""
 
+import math
 from typing import Any
 
 import equinox as eqx
@@ -16,13 +17,15 @@ from .._types import Count, Flag, Scalar
 # (stiff forces, fast rotations) usually last for several steps, and each attempt costs a
 # few evaluations of the residual.
 _CHORD_WAITS = 10
+# The number of steps whose unknowns are remembered.
+LAST_STEPS = 4
 
 
 class Memory(eqx.Module):
     """The data of the last steps that a solve uses.
 
-    - `added`: the unknowns of the last three steps minus those of a free flight, newest
-      first.
+    - `added`: the unknowns of the last `LAST_STEPS` steps minus those of a free flight,
+      newest first.
     - `is_smooth`: whether the extrapolation of `added` was a better guess for the last step
       than the step before it.
     - `factors`: the factors of the Jacobians of the last three steps, newest first; `None`
@@ -43,9 +46,10 @@ class Memory(eqx.Module):
 def predicted(memory: Memory) -> PyTree[Any]:
     """The predicted difference between the unknowns of a step and those of a free flight.
 
-    For a smooth motion this is an extrapolation of the last three steps, and for one that
-    changes quickly it is the difference of the last step. The choice is the one that would
-    have been better for the last step.
+    For a smooth motion this is the cubic extrapolation of the last four steps, and for one
+    that changes quickly it is the difference of the last step. The choice is the one that
+    would have been better for the last step. From three steps, the chord method would need
+    a tenth to a quarter more corrections (chains of points and bodies, steps of 1 ms).
     """
     smooth, last = _candidates(memory)
     choose = lambda x, y: jnp.where(memory.is_smooth, x, y)
@@ -89,13 +93,15 @@ def _wait_after(wait: Count | None, root: Root) -> Count | None:
 
 
 def extrapolated(x: Array) -> Array:
-    """The quadratic extrapolation of the last three values, which are newest first."""
-    return 3 * x[0] - 3 * x[1] + x[2]
+    """The next of some values, which are newest first, on a polynomial through all."""
+    count = x.shape[0]
+    terms = [(-1) ** k * math.comb(count, k + 1) * x[k] for k in range(count)]
+    return sum(terms[1:], start=terms[0])
 
 
 def _shifted(new: Array, old: Array) -> Array:
-    """The last three values after a step with the value `new`."""
-    return jnp.stack([new, old[0], old[1]])
+    """The last values after a step with the value `new`."""
+    return jnp.concatenate([new[None], old[:-1]])
 
 
 def for_length(
@@ -105,9 +111,9 @@ def for_length(
     first, to steps of the length `length`.
 
     What a step adds to a free flight is proportional to its length, so their quotient is
-    extrapolated quadratically from the midpoints of the three steps. `solve` extrapolates
-    `3 x0 - 3 x1 + x2`, or repeats `x0`: the entries are chosen such that it finds the
-    extrapolated value, or the last one.
+    extrapolated quadratically from the midpoints of the last three steps. `solve`
+    extrapolates `4 x0 - 6 x1 + 4 x2 - x3`, or repeats `x0`: the entries are chosen such
+    that it finds the extrapolated value, or the last one.
     """
     ends = np.cumsum(stages)
     # The midpoint of a backward stage may lie outside of the step, hence the clipping.
@@ -125,9 +131,9 @@ def for_length(
     def resampled(x: Array) -> Array:
         shaped = lambda w: w.reshape(-1, *[1] * (x.ndim - 2))
         rates = x[:, 0] / a, x[:, 1] / b, x[:, 2] / c
-        smooth = sum(shaped(w) * rate for w, rate in zip(weights, rates, strict=True))
-        last = length * rates[0]
-        return jnp.stack([last, last, length * smooth], axis=1)
+        rate = sum(shaped(w) * rate for w, rate in zip(weights, rates, strict=True))
+        last, smooth = length * rates[0], length * rate
+        return jnp.stack([last, last, smooth, 3 * smooth - 2 * last], axis=1)
 
     added = jax.tree.map(resampled, memory.added)
     return eqx.tree_at(lambda memory: memory.added, memory, added)
@@ -135,6 +141,6 @@ def for_length(
 
 def with_history(new: Memory, old: Memory) -> Memory:
     """The last step of the stacked memory `new`, and before it the steps of `old`."""
-    join = lambda x, y: jnp.concatenate([x[:, :1], y[:, :2]], axis=1)
+    join = lambda x, y: jnp.concatenate([x[:, :1], y[:, :-1]], axis=1)
     added = jax.tree.map(join, new.added, old.added)
     return eqx.tree_at(lambda memory: memory.added, new, added)
