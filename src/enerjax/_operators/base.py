@@ -36,6 +36,7 @@ from typing import Any, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
@@ -565,7 +566,8 @@ def _term_size(
     inputs = jax.lax.stop_gradient(inputs)
     flat, unravel = ravel_pytree(inputs)
     # Multiples of the golden ratio differ from each other modulo one.
-    parts = 0.5 + (0.618034 * jnp.arange(1, flat.size + 1, dtype=flat.dtype)) % 1
+    parts = 0.5 + (0.618034 * np.arange(1, flat.size + 1)) % 1
+    parts = jnp.asarray(parts, flat.dtype)
     value, change = jax.jvp(of, (inputs,), (unravel(parts * flat),))
     # The derivative can be non-finite if `fn` is not differentiable in `args`.
     size = jnp.abs(value) + jnp.where(jnp.isfinite(change), jnp.abs(change), 0)
