@@ -14,6 +14,7 @@ from jax.flatten_util import ravel_pytree
 import enerjax as ej
 from enerjax._operators import SeparableModel
 from enerjax._run import without_jacobian
+from enerjax._run.prediction import extrapolated, LAST_STEPS
 from enerjax._solvers import Chord, find_root, Newton, schur, schur_tables
 from enerjax._solvers.linear.block_diagonal import in_blocks
 
@@ -21,6 +22,18 @@ from .helpers import EPS, SCHEMES
 
 
 SIZE = 30
+
+# The first guess ---------------------------------------------------------------------------
+
+
+def test_a_cubic_motion_is_predicted_exactly():
+    cubic = np.poly1d([0.3, -1.0, 2.0, 0.5])
+    before = np.arange(LAST_STEPS)[::-1]
+    values = jnp.asarray(np.stack([cubic(before), cubic(before + 0.5)], axis=1))
+    expected = [cubic(LAST_STEPS), cubic(LAST_STEPS + 0.5)]
+    # Round-off of sums whose terms are at most 100.
+    np.testing.assert_allclose(extrapolated(values), expected, rtol=0, atol=1e3 * EPS)
+
 
 # The matrix of the multipliers ------------------------------------------------------------
 

@@ -127,3 +127,19 @@ def test_a_simplified_program_has_each_operation_once():
     assert lean(x) == repeating(x)
     slope = lambda fn: jax.grad(lambda x: fn(x)["product"])(x)
     np.testing.assert_array_equal(slope(lean), slope(repeating))
+
+
+def test_equal_tables_of_a_simplified_program_are_one():
+    # Each call of the function brings an array of its own.
+    turned = lambda x: jnp.asarray(np.eye(3)) + x[:, None] * x
+    repeating = lambda x: dict(a=turned(x) ** 2, b=turned(x) ** 3)
+
+    def once(x):
+        frame = turned(x)
+        return dict(a=frame**2, b=frame**3)
+
+    x = jnp.linspace(0.1, 0.9, 3)
+    lean = simplified(repeating)
+    assert num_operations(lean, x) == num_operations(once, x)
+    assert num_operations(lean, x) < num_operations(repeating, x)
+    jax.tree.map(np.testing.assert_array_equal, lean(x), repeating(x))
