@@ -23,7 +23,7 @@ from .helpers import EPS, SCHEMES
 
 SIZE = 30
 
-# The first guess ---------------------------------------------------------------------------
+# The first guess --------------------------------------------------------------------------
 
 
 def test_a_cubic_motion_is_predicted_exactly():

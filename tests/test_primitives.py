@@ -131,7 +131,7 @@ def test_a_simplified_program_has_each_operation_once():
 
 def test_equal_tables_of_a_simplified_program_are_one():
     # Each call of the function brings an array of its own.
-    turned = lambda x: jnp.asarray(np.eye(3)) + x[:, None] * x
+    turned = lambda x: jnp.asarray(np.eye(3)) + x[:, None] * x[None]
     repeating = lambda x: dict(a=turned(x) ** 2, b=turned(x) ** 3)
 
     def once(x):
