@@ -11,3 +11,4 @@ from .corrected import (
     Gonzalez as Gonzalez,
     MeanValue as MeanValue,
 )
+from .rotations import ANGLE as ANGLE, OTHER as OTHER, RotationRule as RotationRule

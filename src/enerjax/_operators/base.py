@@ -155,6 +155,7 @@ class AbstractModel(eqx.Module):
         self,
         unknowns: tuple[Float[Array, " np"], ...],
         velocities: Callable[[Reaction], tuple[Velocities, ...]],
+        derivative: AbstractDerivative,
         step: Increments | None,
     ) -> tuple[Velocities, ...]:
         """The field `v` of the states at the nodes of a step.

@@ -13,13 +13,18 @@ for the velocities in closed form.
 
 import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._discrete import AbstractCorrected, AbstractDerivative
+from .._discrete import (
+    AbstractCorrected,
+    AbstractDerivative,
+    ChainRule,
+)
 from .._solvers import (
     affine_root,
     as_dense,
@@ -39,7 +44,6 @@ from .._system import (
     ByRates,
     Frames,
     mean_momentum,
-    Rates,
     State,
     System,
 )
@@ -63,11 +67,26 @@ from .elements import (
 from .interval import Gradient, gradient_and_work, Increment, Scales, Time, time_rate
 
 
+class _Motion(NamedTuple):
+    """The points between which a discrete gradient is taken, positions or these with rates.
+
+    - `at`: the positions and the rates of a point.
+    - `parts`: the gradient with respect to the positions, and further rows, of a gradient
+      with respect to the points.
+    """
+
+    start: Array
+    end: Array
+    at: Callable[[Array], tuple[Coordinates, Coordinates]]
+    parts: Callable[[Array], tuple[Coordinates, Increments | None]]
+
+
 class SeparableModel(AbstractModel):
     """A `System` for fixed `args`; the `v` of its states are the velocities.
 
-    With `rotates`, its rigid bodies are moved by rotations, and velocities and constraints
-    are those of this kind of coordinates. Otherwise the velocities are those of the user.
+    Rigid bodies in the dimensions `rotates_in` (2 in the plane, 3 in space) are moved by
+    rotations, and velocities and constraints are those of this kind of coordinates.
+    Otherwise the velocities are those of the user.
     """
 
     system: System
@@ -80,7 +99,7 @@ class SeparableModel(AbstractModel):
     kinematics: AbstractKinematics
     # The index tables of `delassus_matrix`; `None` where there is none.
     constraint_tables: SchurTables | None = eqx.field(static=True)
-    # The model without rotations, if this one has some.
+    # The model with the velocities of the user, if those of this one are others.
     without_rotations: "SeparableModel | None"
 
     def __init__(
@@ -89,14 +108,15 @@ class SeparableModel(AbstractModel):
         state: State,
         args: Args,
         *,
-        rotates: bool = False,
+        rotates_in: tuple[int, ...] = (),
     ):
         self.system = system
         self.args = args
         self.has_linear_potential = has_linear_potential(system, state.q, args)
-        kind = system.kinematics.with_rotations(state.q) if rotates else system.kinematics
-        rotates = kind is not system.kinematics
-        self.without_rotations = SeparableModel(system, state, args) if rotates else None
+        kind = system.kinematics.with_rotations(state.q, rotates_in)
+        self.without_rotations = (
+            SeparableModel(system, state, args) if kind.has_own_velocities else None
+        )
         self.kinematics = kind.with_blocks(state.q, self.coordinate, args)
         self.inertia = kind.inertia(
             lambda: system.inertia(state, args),
@@ -177,9 +197,14 @@ class SeparableModel(AbstractModel):
     def force(self, q: Coordinates, v: Velocities, t: Time) -> Velocities:
         return self.user_force(q, self.kinematics.user_velocity(q, v), t)
 
+    def _pull_back_at(self, q: Coordinates, gradient: Coordinates) -> Increments:
+        """The rows of a gradient for a step of zero length."""
+        at_rest = jnp.zeros_like(self.scales.step)
+        return self.kinematics.pull_back(q, q, at_rest, gradient)
+
     def slope(self, state: State) -> Increments:
         q = state.q
-        slope = self.kinematics.pull_back(q, q, jax.grad(self._potential)(q))
+        slope = self._pull_back_at(q, jax.grad(self._potential)(q))
         if self.system.force is None:
             return slope
         return slope - self.pull(q, q, self.force(q, state.v, state.t))
@@ -212,9 +237,10 @@ class SeparableModel(AbstractModel):
         self,
         unknowns: tuple[Float[Array, " np"], ...],
         velocities: Callable[[Reaction], tuple[Velocities, ...]],
+        derivative: AbstractDerivative,
         step: Increments | None,
     ) -> tuple[Velocities, ...]:
-        return velocities(functools.partial(self._reaction, step))
+        return velocities(functools.partial(self._reaction, derivative, step))
 
     def momentum_rows(self, rates: Velocities) -> Float[Array, " np"]:
         return rates[:0]
@@ -249,43 +275,54 @@ class SeparableModel(AbstractModel):
         is_step: bool,
     ) -> Gradient:
         fixed, driven, nonholonomic = self.split(increment, a.q)
-        mean_rate, torque = self._mean_rates(a, b, h, increment, is_step)
+        step = h * increment.rate if is_step else None
+        rule = self.chain_rule(derivative, step)
+        if rule is None:
+            motion = self._motion(a, b, h, increment, is_step)
+        else:
+            derivative, motion = rule, self._motion_with_rates(a, b)
 
         constraint = lambda q: jnp.concatenate([self.fixed(q), self.coordinate(q)])
-        rate = lambda q: jax.jvp(self.fixed, (q,), (mean_rate(q),))[1]
-        slip_rate = lambda q: self.nonholonomic(q) @ mean_rate(q)
+        rate = lambda q, rates: jax.jvp(self.fixed, (q,), (rates,))[1]
+        slip_rate = lambda q, rates: self.nonholonomic(q) @ rates
         has_slip_rate = self.has_slip_rate(nonholonomic)
 
-        def action(q: Coordinates) -> Scalar:
+        def action(x: Array) -> Scalar:
+            q, rates = motion.at(x)
             out = h * self._potential(q)
             if fixed.impulse.size > 0:
                 out = out + fixed.impulse @ constraint(q)
             if fixed.velocity_impulse.size > 0:
-                out = out + h * fixed.velocity_impulse @ rate(q)
+                out = out + h * fixed.velocity_impulse @ rate(q, rates)
             if has_slip_rate:
-                out = out + h * nonholonomic.velocity_impulse @ slip_rate(q)
+                out = out + h * nonholonomic.velocity_impulse @ slip_rate(q, rates)
             return out
 
-        def driven_action(q: Coordinates, t: Time) -> Scalar:
-            return self.driven_action(q, mean_rate(q), t, h, driven)
+        def driven_action(x: Array, t: Time) -> Scalar:
+            q, rates = motion.at(x)
+            return self.driven_action(q, rates, t, h, driven)
 
         with_time = None if self.system.driven is None else driven_action
-        ends, none = ((a.q, a.t), (b.q, b.t)), jnp.zeros((0,), h.dtype)
+        ends = (motion.start, a.t), (motion.end, b.t)
+        none = jnp.zeros((0,), h.dtype)
         energies = self._element_energies(a.q)
         if energies is None or not isinstance(derivative, AbstractCorrected):
             size = self.action_size(derivative, a, h, increment)
-            impulse, work = gradient_and_work(
+            gradient, work = gradient_and_work(
                 derivative, action, with_time, *ends, size=size
             )
+            impulse, torque = motion.parts(gradient)
             impulse = self.nonholonomic_impulse(impulse, a, b, nonholonomic)
             return Gradient(impulse, none, work, torque)
         rows: list[Summands] = [lambda q, fn=fn: h * fn(q) for fn in energies]
         rows += [lambda q: fixed.impulse * constraint(q)]
         if fixed.velocity_impulse.size > 0:
-            rows += [lambda q: h * fixed.velocity_impulse * rate(q)]
+            rows += [lambda q: h * fixed.velocity_impulse * rate(*motion.at(q))]
         if has_slip_rate:
-            rows += [lambda q: h * nonholonomic.velocity_impulse * slip_rate(q)]
-        impulse, work = gradient_and_work_by_rows(derivative, rows, with_time, *ends)
+            eta = nonholonomic.velocity_impulse
+            rows += [lambda q: h * eta * slip_rate(*motion.at(q))]
+        gradient, work = gradient_and_work_by_rows(derivative, rows, with_time, *ends)
+        impulse, torque = motion.parts(gradient)
         if self.has_linear_potential:
             impulse = impulse + h * jax.grad(self._potential)(a.q)
         impulse = self.nonholonomic_impulse(impulse, a, b, nonholonomic)
@@ -302,7 +339,9 @@ class SeparableModel(AbstractModel):
             h * rate,
             self.args,
         )
-        balance = balance + self.kinematics.pull_back(a.q, b.q, gradient.impulse)
+        balance = balance + self.kinematics.pull_back(
+            a.q, b.q, h * rate, gradient.impulse
+        )
         if gradient.rows is not None:
             balance = balance + gradient.rows
         return balance, gradient.rate
@@ -310,31 +349,70 @@ class SeparableModel(AbstractModel):
     def reaction_row(self, state: State, eta: JointMultipliers) -> Float[Array, " np"]:
         return jnp.zeros((0,), state.q.dtype)
 
-    def _mean_rates(
+    def chain_rule(
+        self, derivative: AbstractDerivative, step: Increments | None
+    ) -> AbstractDerivative | None:
+        """The chain rule with respect to the rows, where a kind of coordinates has one and
+        the discrete gradients are those of a step by the chain rule; else `None`."""
+        if step is None or not isinstance(derivative, ChainRule):
+            return None
+        return self.kinematics.chain_rule(step)
+
+    def _motion(
         self, a: State, b: State, h: Scalar, increment: Increment, is_step: bool
-    ) -> tuple[Rates, Increments | None]:
-        """The rates in the gradient of `psi` with respect to `q`, and further rows."""
-        eta = increment.velocity_impulse
+    ) -> "_Motion":
+        """The positions, and the rates in the gradient of `psi` with respect to them."""
+        eta, mean = increment.velocity_impulse, 0.5 * (a.v + b.v)
         if not is_step or eta.size == 0:
-            mean = 0.5 * (a.v + b.v)
-            return lambda q: self.lift(q, mean), None
-        at = lambda state: self._by_rates((state.q, state.t), eta)
-        by_rates = lambda: (at(a), at(b))
-        rates, rows = self.kinematics.mean_rates(a, b, self.lift, by_rates)
-        return rates, None if rows is None else h * rows
+            at = lambda q: (q, self.lift(q, mean))
+            return _Motion(a.q, b.q, at, lambda gradient: (gradient, None))
+        ends = lambda: tuple(self._by_rates((x.q, x.t), eta) for x in (a, b))
+        rates, rows = self.kinematics.mean_rates(a, b, self.lift, ends)
+        rows = None if rows is None else h * rows
+        at = lambda q: (q, rates(q))
+        return _Motion(a.q, b.q, at, lambda gradient: (gradient, rows))
+
+    def _motion_with_rates(self, a: State, b: State) -> "_Motion":
+        """Positions and rates together, for gradients with respect to the rows."""
+        size = a.q.size
+        ends = (jnp.concatenate([x.q, self.lift(x.q, x.v)]) for x in (a, b))
+        split = lambda x: (x[:size], x[size:])
+        return _Motion(*ends, split, lambda rows: (jnp.zeros_like(a.q), rows[:size]))
 
     def _reaction(
-        self, step: Increments | None, a: Position, b: Position, eta: JointMultipliers
+        self,
+        derivative: AbstractDerivative,
+        step: Increments | None,
+        a: Position,
+        b: Position,
+        eta: JointMultipliers,
     ) -> Velocities:
         """The reaction over an interval, which is that of `step` if this is not `None`."""
         if eta.size == 0:
             return jnp.zeros((self.inertia.shape[0],), eta.dtype)
+        rule = self.chain_rule(derivative, step)
+        if rule is not None:
+            return self.inverse_inertia @ self._momentum_of_rates(rule, a, b, eta)
         ends = self._by_rates(a, eta), self._by_rates(b, eta)
         if step is None:
             momentum = mean_momentum(*ends, self._lowered)
         else:
             momentum = self.kinematics.momentum_of_rates(*ends, step, self._lowered)
         return self.inverse_inertia @ momentum
+
+    def _momentum_of_rates(
+        self, rule: AbstractDerivative, a: Position, b: Position, eta: JointMultipliers
+    ) -> Velocities:
+        """The discrete gradient of `eta . psi` with respect to the rates."""
+        (qa, ta), (qb, tb) = a, b
+        size, rest = qa.size, jnp.zeros_like(qa)  # rates are linear, so any will do
+        if ta is None:
+            energy = lambda x: eta @ self.joint_rate(x[:size], x[size:], None)
+            ends = (jnp.concatenate([q, rest]) for q in (qa, qb))
+        else:
+            energy = lambda x: eta @ self.joint_rate(x[:size], x[size:-1], x[-1])
+            ends = (jnp.concatenate([q, rest, t[None]]) for q, t in (a, b))
+        return rule.gradient(energy, *ends)[size : 2 * size]
 
     def _by_rates(self, position: Position, eta: JointMultipliers) -> ByRates:
         """`B^T eta` of the joints: the gradient of `eta . psi` with respect to the rates
@@ -474,7 +552,7 @@ class SeparableModel(AbstractModel):
             # arrays that are constants of the traced function.
             pulled = self._momentum_rows(q, self.inertia @ acceleration)
             joints = self.constraint_force(q, t, multipliers)
-            pulled = pulled + self.kinematics.pull_back(q, q, joints)
+            pulled = pulled + self._pull_back_at(q, joints)
             rate = self.joint_change(q, acceleration, t) + free_rate
             rows = (
                 (pulled + slope) / scales.step,

@@ -30,6 +30,7 @@ from .kinematics import (
     ConfigurationKinematics,
     DirectorKinematics,
     IdentityKinematics,
+    PlanarKinematics,
 )
 from .names import Names
 
@@ -156,7 +157,10 @@ class System(AbstractSystem):
         self.names = names
         self.events = tuple(events)
         if rigid_bodies is not None:
-            self.kinematics = DirectorKinematics(body_table(rigid_bodies))
+            table = body_table(rigid_bodies)
+            in_plane = table.array.shape[1] == 3
+            kind = PlanarKinematics if in_plane else DirectorKinematics
+            self.kinematics = kind(table)
         elif kinematics is not None:
             self.kinematics = ConfigurationKinematics(kinematics)
         else:

@@ -166,7 +166,9 @@ class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
         gradient = step.discrete_gradient(start, end, z.end)
         gradient = gradient.less(step.step_load(end, z.end))
         stresses = strains.stresses(jumps.strain)
-        terms = strains.gradient(start, end, h / 2 * stresses, h / 2 * jumps.impulse)
+        terms = strains.gradient(
+            start, end, h * z.end.rate, h / 2 * stresses, h / 2 * jumps.impulse
+        )
         change = strains.change(start.q, end.q, step.displacement(z.end))
         moved = change - self._alpha(h) * jumps.strain
         of_strains = jumps.impulse - h / 6 * strains.stresses(moved)

@@ -115,7 +115,7 @@ def check_without_rotations(
     """Raises an error for a flat body in a scheme that moves no bodies by rotations."""
     if not isinstance(system, System):
         return
-    if system.kinematics.with_rotations(state.q) is system.kinematics:
+    if system.kinematics.with_rotations(state.q, (3,)) is system.kinematics:
         return
     is_regular = _facts(system, state, args)["regular"]
     if is_known(is_regular) and not is_regular:

@@ -26,6 +26,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
+from ..._discrete import AbstractDerivative
 from ..._solvers import IndependentBlocks, solve_by_blocks, Symmetric
 from ..._types import (
     Args,
@@ -80,6 +81,20 @@ class AbstractKinematics(eqx.Module):
     def has_canonical_rates(self) -> bool:
         """Whether `L = I`, and steps are added to the coordinates."""
 
+    @property
+    def has_own_velocities(self) -> bool:
+        """Whether a step uses velocities other than those of the user."""
+        return False
+
+    def chain_rule(self, step: Increments) -> AbstractDerivative | None:
+        """The chain rule over a step, with respect to the rows instead of the coordinates.
+
+        It is for coordinates that are not linear in the steps. Then the discrete gradients
+        of functions of coordinates and rates are taken in both together. `None` where the
+        chain rule in the coordinates conserves momenta.
+        """
+        return None
+
     @abc.abstractmethod
     def has_inertia(self, energy: KineticEnergy, inertia: Symmetric) -> Flag:
         """Whether coordinates of this kind can have this kinetic energy, and the inertia
@@ -101,10 +116,13 @@ class AbstractKinematics(eqx.Module):
         """How the coordinates move, in words."""
 
     @abc.abstractmethod
-    def with_rotations(self, q: Coordinates) -> "AbstractKinematics":
+    def with_rotations(
+        self, q: Coordinates, dimensions: tuple[int, ...]
+    ) -> "AbstractKinematics":
         """The kind that moves bodies with these coordinates by rotations.
 
-        It is the same kind if there are no such bodies.
+        It is the same kind if there are no such bodies in these dimensions: 2 in the plane,
+        3 in space.
         """
 
     @abc.abstractmethod
@@ -171,7 +189,11 @@ class AbstractKinematics(eqx.Module):
 
     @abc.abstractmethod
     def pull_back(
-        self, qa: Coordinates, qb: Coordinates, gradient: Coordinates
+        self,
+        qa: Coordinates,
+        qb: Coordinates,
+        step: Increments,
+        gradient: Coordinates,
     ) -> Increments:
         """`P^T gradient`, the rows of a gradient with respect to the coordinates."""
 
@@ -277,7 +299,7 @@ class AbstractFlatKinematics(AbstractKinematics):
     def displacement(self, q, step):
         return step
 
-    def pull_back(self, qa, qb, gradient):
+    def pull_back(self, qa, qb, step, gradient):
         return gradient
 
     def mean_rates(self, a, b, lift, by_rates):

@@ -44,7 +44,7 @@ class ConfigurationKinematics(AbstractFlatKinematics):
     def describe(self, q, v):
         return f"{q.size} coordinates with {v.size} velocities v = L(q) qdot"
 
-    def with_rotations(self, q):
+    def with_rotations(self, q, dimensions):
         return self
 
     def with_blocks(self, q, relations, args):

@@ -41,8 +41,8 @@ class DirectorKinematics(AbstractPlainKinematics):
         second, size = self._second_moments(inertia)
         return _is_positive_definite(second - rounding * size)
 
-    def with_rotations(self, q):
-        return self._rotations(q.size)
+    def with_rotations(self, q, dimensions):
+        return self._rotations(q.size) if 3 in dimensions else self
 
     def constraint(self, q):
         return _bodies(self.table, q.size).constraint(q)

@@ -62,7 +62,7 @@ class IdentityKinematics(AbstractPlainKinematics):
     def is_regular(self, inertia, rounding):
         return jnp.array(True)
 
-    def with_rotations(self, q):
+    def with_rotations(self, q, dimensions):
         return self
 
     def constraint(self, q):

@@ -17,13 +17,15 @@ Pose: TypeAlias = tuple[Vector3, Axes]
 
 
 def body_table(rigid_bodies: Any) -> Indices:
-    """The checked indices of the coordinates of rigid bodies, shape `(bodies, 12)`."""
+    """The checked indices of the coordinates of rigid bodies, shape `(bodies, 12)`, in the
+    plane `(bodies, 3)`."""
     table = np.asarray(rigid_bodies)
-    if table.ndim != 2 or table.shape[1] != 12 or table.dtype.kind not in "iu":
+    if table.ndim != 2 or table.shape[1] not in (3, 12) or table.dtype.kind not in "iu":
         raise ValueError(
             "`System(rigid_bodies=...)` must hold the indices of the twelve coordinates of "
             "each body (its mass centre, then its three axes), integers of shape "
-            f"(bodies, 12); got shape {table.shape} of {table.dtype}."
+            "(bodies, 12), or in the plane of three (its mass centre, then its angle), "
+            f"shape (bodies, 3); got shape {table.shape} of {table.dtype}."
         )
     if table.min(initial=0) < 0 or np.unique(table).size != table.size:
         raise ValueError(

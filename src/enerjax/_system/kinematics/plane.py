@@ -1,0 +1,109 @@
+"""Rigid bodies in the plane, with the mass centre and an angle as coordinates.
+
+The velocities of a body are the rates of its coordinates. A step has three unknowns, a
+translation and a number `Theta`, which turns the body by the angle
+
+    theta_b - theta_a = 2 atan(t),   t = Theta/2
+
+This is Cayley's rotation, as in space: with an axis `d` of the body, its mean `dm` at both
+ends, and the rotation `J` by a right angle, `d_b - d_a = Theta J dm` exactly. So a point of
+the body moves by its mean lever times `Theta`, and a gradient `D_theta` in the angle that
+satisfies the chain rule for difference quotients has the torque
+
+    D_theta (theta_b - theta_a) / Theta = D_theta atan(t)/t,
+
+which is that of the forces at the mean lever. Its product with `Theta` is the change of the
+energy, and the torques of a function that rotations do not change vanish together, so that
+energy and angular momentum are conserved. (With a step in the angle itself the torque is
+`D_theta`, which differs from that of the forces by a factor `1 + t^2/3 + ...`.) As the mean
+of `omega` times `h` is `Theta`, a body that turns freely is late by `(h omega)^2/12` of its
+angle.
+
+Rates of the axes, which enter constraints at velocity level, have rules of their own; see
+`_discrete/rotations.py`.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..._discrete import ANGLE, OTHER, RotationRule
+from ..._programs import Indices
+from ..._types import Increments
+from .plain import IdentityKinematics
+
+
+class PlanarKinematics(IdentityKinematics):
+    """`v = qdot`, with steps in the angle of each body.
+
+    - `table`: the indices of the coordinates of each body, shape `(bodies, 3)`; see
+      `body_table`.
+    """
+
+    table: Indices = eqx.field(static=True)
+
+    def has_inertia(self, energy, inertia):
+        # The mass of a body is the same along both axes, and turning it moves no mass
+        # centre: the energy stays the same if all mass centres move across their velocity.
+        dtype, size = inertia.dtype, inertia.shape[0]
+        probe = jnp.cos(jnp.arange(1, size + 1, dtype=dtype))
+        table = self.table.array
+        across, signs = np.arange(size), np.ones(size)
+        across[table[:, :2]] = table[:, 1::-1]
+        signs[table[:, 0]] = -1
+        other = jnp.asarray(signs, dtype) * probe[across]
+        bound = jnp.abs(probe) + jnp.abs(other)
+        size = bound @ (inertia.diagonal() * bound)
+        return jnp.abs(energy(probe) - energy(other)) <= 1e3 * jnp.finfo(dtype).eps * size
+
+    def with_rotations(self, q, dimensions):
+        return PlanarRotations(self.table) if 2 in dimensions else self
+
+
+class PlanarRotations(PlanarKinematics):
+    """`v = qdot`, with Cayley's rotation of each body in a step."""
+
+    def describe(self, q, v):
+        others = q.size - self.table.array.size
+        return (
+            f"{len(self.table.array)} rigid bodies in the plane, each moved by a "
+            "translation and a rotation" + (f", and {others} others" if others > 0 else "")
+        )
+
+    def displacement(self, q, step):
+        return step * _angle_over_tangent(self._half_turns(step))
+
+    def pull_back(self, qa, qb, step, gradient):
+        return gradient * _angle_over_tangent(self._half_turns(step))
+
+    def chain_rule(self, step):
+        return RotationRule(self._kinds(step.size), self._half_turns(step))
+
+    def _half_turns(self, step: Increments) -> Increments:
+        """`Theta/2` of the angles, and zeros for all other coordinates."""
+        # All formulas are the identity where this is zero, so nothing is put together.
+        weights = np.zeros(step.size)
+        weights[self.table.array[:, 2]] = 0.5
+        return jnp.asarray(weights, step.dtype) * step
+
+    def _kinds(self, size: int) -> Indices:
+        kinds = np.full(size, OTHER)
+        kinds[self.table.array[:, 2]] = ANGLE
+        return Indices(kinds)
+
+
+# The coefficients of `atan(x) / x` in `x^2`; below pi/16 they reach round-off.
+_SERIES = [(-1) ** k / (2 * k + 1) for k in range(12)]
+
+
+def _angle_over_tangent(t: Float[Array, " n"]) -> Float[Array, " n"]:
+    """`atan(t) / t`, without a choice: the angle is halved three times."""
+    factor = jnp.ones_like(t)
+    for _ in range(3):
+        growth = 1 / (1 + jnp.sqrt(1 + t * t))
+        t, factor = t * growth, factor * growth
+    square, series = t * t, jnp.zeros_like(t)
+    for coefficient in reversed(_SERIES):
+        series = series * square + coefficient
+    return 8 * factor * series
