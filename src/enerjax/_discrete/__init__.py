@@ -1,3 +1,4 @@
+from . import elementary as elementary
 from .base import AbstractDerivative as AbstractDerivative
 from .chain_rule import (
     ChainRule as ChainRule,

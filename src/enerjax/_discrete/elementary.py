@@ -232,15 +232,29 @@ def smooth(function: Callable[[Array], Array], reach: float) -> Quotient:
 
 
 def _even(series: Sequence[float]) -> Callable[[Array], Array]:
-    """An even function near zero, by its series in `x**2`."""
+    """An even function near zero, by its series in `x**2`.
 
+    Its derivative has a series of its own, so that it is one number for all directions.
+    """
+    slopes = [2 * k * coefficient for k, coefficient in enumerate(series)][1:]
+
+    @jax.custom_jvp
     def function(x: Array) -> Array:
-        square, total = x * x, jnp.zeros_like(x)
-        for coefficient in reversed(series):
-            total = total * square + coefficient
-        return total
+        return _polynomial(series, x * x)
+
+    @function.defjvp
+    def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+        (x,), (d,) = primals, tangents
+        return function(x), x * _polynomial(slopes, x * x) * d
 
     return function
+
+
+def _polynomial(coefficients: Sequence[float], x: Array) -> Array:
+    total = jnp.full_like(x, coefficients[-1])
+    for coefficient in reversed(coefficients[:-1]):
+        total = total * x + coefficient
+    return total
 
 
 def _factorials(sign: int) -> list[float]:

@@ -32,7 +32,7 @@ of `omega`, which has the right value too. Differences of rates have the increme
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -43,14 +43,16 @@ from jaxtyping import Array
 from .._programs import evaluate, Indices, is_known, name_of, wrapped_program
 from .._programs.numpy_primitives import moved
 from .._programs.primitives import DATA_MOVEMENT, moved_operands
-from .._types import Coordinates, Scalar
+from .._types import Scalar
 from . import elementary
-from .base import AbstractDerivative
 from .chain_rule import valid_increment
 from .fallback import fallback
 from .rules import RULES
-from .transform import Moving, moves, Value, Walk
+from .transform import moves, Moving, Value, Walk
 
+
+# Coordinates, their rates, and the time.
+Motion: TypeAlias = tuple[Array, Array, Array | None]
 
 # What a number is. A constant may stand for an angle or a rate that does not change.
 CONSTANT, OTHER, ANGLE, RATE = range(4)
@@ -63,6 +65,7 @@ class Turning(NamedTuple):
     - `d`: the increments, of angles `Theta`. Those of multiples are for the angle itself.
     - `half`: `t` of angles and of their rates, zero of other numbers.
     - `turn`: `Theta`, as an increment, of rates.
+    - `whole`: the increments in any other function; see `as_moving`.
     - `kinds`: an array of `CONSTANT`, `OTHER`, `ANGLE` and `RATE`.
     - `factor`: the numbers are this multiple of angles or rates.
     """
@@ -72,6 +75,7 @@ class Turning(NamedTuple):
     d: Array
     half: Array
     turn: Array
+    whole: Array
     kinds: np.ndarray
     factor: float = 1.0
 
@@ -80,12 +84,8 @@ class Turning(NamedTuple):
         return bool(np.all((self.kinds == kind) | (self.kinds == CONSTANT)))
 
 
-class RotationRule(AbstractDerivative):
-    """The chain rule over a step that rotates bodies, for functions of coordinates, of
-    coordinates and their rates, or of these and the time.
-
-    The gradient is that with respect to `Theta` in place of each angle. Its product with
-    the increments of the other numbers and with `Theta` is the change of the function.
+class RotationRule(eqx.Module):
+    """The chain rule over a step that rotates bodies.
 
     - `kinds`: of each coordinate, `OTHER` or `ANGLE`.
     - `half`: `t` of each angle, and zero for other coordinates.
@@ -95,33 +95,31 @@ class RotationRule(AbstractDerivative):
     half: Array
 
     def gradient(
-        self,
-        fn: Callable[[Coordinates], Scalar],
-        a: Coordinates,
-        b: Coordinates,
-        *,
-        weights: Coordinates | float = 1.0,
-        size: Scalar | float = 0.0,
-    ) -> Coordinates:
-        del weights, size  # no correction
+        self, fn: Callable[[Motion], Scalar], a: Motion, b: Motion
+    ) -> tuple[Array, Array, Array | None]:
+        """The gradient of a function of `(coordinates, rates, time)`.
+
+        The first part is the gradient with respect to the steps, with `Theta` in place of
+        each angle. The products with the steps and with the changes of the rates and of the
+        time add up to the change of the function. The time may be `None`.
+        """
         program = jax.make_jaxpr(fn)(a)
 
-        def push(d: Array) -> Scalar:
-            (out,) = _Walk(RULES, fallback).closed(program, [self._input(a, b, d)])
+        def push(d: Motion) -> Scalar:
+            (out,) = _Walk(RULES, fallback).closed(program, self._inputs(a, b, d))
             return valid_increment(as_moving(out) if isinstance(out, Turning) else out)
 
-        value, pull = jax.vjp(push, jnp.zeros_like(a))
+        value, pull = jax.vjp(push, jax.tree.map(jnp.zeros_like, a))
         return pull(jnp.ones_like(value))[0]
 
-    def _input(self, a: Array, b: Array, d: Array) -> "Turning":
+    def _inputs(self, a: Motion, b: Motion, d: Motion) -> list[Value]:
         kinds = self.kinds.array
-        count, (blocks, rest) = kinds.size, divmod(a.size, kinds.size)
         of_rates = np.where(kinds == ANGLE, RATE, kinds)
-        every = [kinds, *[of_rates] * (blocks - 1), np.full(rest, OTHER)]
-        none = [jnp.zeros((rest,), a.dtype)] if rest else []
-        half = jnp.concatenate([self.half] * blocks + none)
-        turn = jnp.concatenate([d[:count]] * blocks + none)
-        return Turning(a, b, d, half, turn, np.concatenate(every))
+        parts = [
+            turning(a[k], b[k], d[k], self.half, d[0], own)
+            for k, own in enumerate((kinds, of_rates))
+        ]
+        return parts if a[2] is None else [*parts, Moving(a[2], b[2], d[2])]
 
 
 class _Walk(Walk):
@@ -145,20 +143,22 @@ class _Walk(Walk):
 
 def as_moving(value: Turning) -> Moving:
     """The same numbers with the increments that they have in any other function."""
-    a, b, d, t, turn, kinds, factor = value
-    parts = []
-    if np.any(kinds == ANGLE):
-        near = jnp.abs(t) < elementary.SMALL_RATIO
-        change = 0.5 / factor * (b - a)
-        of_angle = elementary.series_or_quotient(
-            near, t, jnp.ones_like(t), elementary.atanc, change
-        )
-        parts.append(factor * of_angle * d)
+    whole = value.whole if value.factor == 1 else value.factor * value.whole
+    return Moving(value.a, value.b, whole)
+
+
+def turning(
+    a: Array, b: Array, d: Array, half: Array, turn: Array, kinds: np.ndarray, factor=1.0
+) -> Turning:
+    """A `Turning` with its increments in any other function."""
     if np.any(kinds == RATE):
-        parts.append(factor * (1 + t * t) * d - 0.5 * t * (b - a) * turn)
-    if len(parts) == 2:
-        return Moving(a, b, jnp.where(jnp.asarray(kinds == RATE), parts[1], parts[0]))
-    return Moving(a, b, parts[0] if parts else d)
+        whole = (1 + half * half) * d - 0.5 / factor * half * (b - a) * turn
+    else:
+        near = jnp.abs(half) < elementary.SMALL_RATIO
+        whole = d * elementary.series_or_quotient(
+            near, half, jnp.ones_like(half), elementary.atanc, 0.5 / factor * (b - a)
+        )
+    return Turning(a, b, d, half, turn, whole, kinds, factor)
 
 
 def _moved(primitive: Any, values: list[Value], params: dict[str, Any]) -> list | None:
@@ -173,8 +173,8 @@ def _moved(primitive: Any, values: list[Value], params: dict[str, Any]) -> list 
         own = [v[field] if k in where else v for k, v in enumerate(entries)]
         return move(primitive, own, params)
 
-    fields = [each(field, evaluate) for field in range(5)]
-    kinds = [np.asarray(x).astype(int) for x in each(5, moved)]
+    fields = [each(field, evaluate) for field in range(6)]
+    kinds = [np.asarray(x).astype(int) for x in each(6, moved)]
     (factor,) = factors
     return [_joined(Turning(*out, factor)) for out in zip(*fields, kinds, strict=True)]
 
@@ -189,10 +189,10 @@ def _entries(value: Value) -> Turning:
     if moves(value):
         none = jnp.zeros_like(value.a)
         kinds = np.full(jnp.shape(value.a), OTHER)
-        return Turning(value.a, value.b, value.d, none, none, kinds)
+        return Turning(value.a, value.b, value.d, none, none, value.d, kinds)
     none = jnp.zeros(jnp.shape(value), jnp.result_type(value))
     kinds = np.full(jnp.shape(value), CONSTANT)
-    return Turning(value, value, none, none, none, kinds)
+    return Turning(value, value, none, none, none, none, kinds)
 
 
 def _joined(value: Turning) -> Value:
@@ -203,19 +203,22 @@ def _joined(value: Turning) -> Value:
 
 def _cosine(primitive: Any, values: list[Value], params: dict[str, Any]) -> list | None:
     (x,) = values
-    return _of_axis(x, jnp.cos, lambda x: -jnp.sin(x))
+    return _of_axis(x, jnp.cos, jnp.sin, jnp.negative)
 
 
 def _sine(primitive: Any, values: list[Value], params: dict[str, Any]) -> list | None:
     (x,) = values
-    return _of_axis(x, jnp.sin, jnp.cos)
+    return _of_axis(x, jnp.sin, jnp.cos, lambda d: d)
 
 
-def _of_axis(x: Turning, component: Callable, slope: Callable) -> list | None:
+def _of_axis(
+    x: Turning, component: Callable, other: Callable, sign: Callable
+) -> list | None:
     if not x.are(ANGLE) or x.factor != 1:
         return None
-    mean = 0.5 * (slope(x.a) + slope(x.b))
-    return [Moving(component(x.a), component(x.b), mean * x.d)]
+    # The mean is written as in the rule of products, which needs it too.
+    mean = 0.5 * (other(x.a) + other(x.b))
+    return [Moving(component(x.a), component(x.b), sign(x.d * mean))]
 
 
 def _sum(primitive: Any, values: list[Value], params: dict[str, Any]) -> list | None:
@@ -255,7 +258,7 @@ def _mean(x: Turning, y: Turning, a: Array, b: Array) -> Turning:
     turn = mean(x.turn, y.turn)
     change = mean(x.d, y.d) if x.are(ANGLE) and y.are(ANGLE) else 0.5 * (x.d + y.d)
     kinds = np.maximum(x.kinds, y.kinds)
-    return Turning(a, b, change, mean(x.half, y.half), turn, kinds, 2.0)
+    return turning(a, b, change, mean(x.half, y.half), turn, kinds, 2.0)
 
 
 def _multiple(primitive: Any, values: list[Value], params: dict[str, Any]) -> list | None:

@@ -407,12 +407,13 @@ class AbstractModel(eqx.Module):
         return self.nonholonomic(0.5 * (qa + qb)) @ displacement
 
     def nonholonomic_impulse(
-        self, gradient: Coordinates, a: State, b: State, increment: Increment
-    ) -> Coordinates:
+        self, gradient: Coordinates | None, a: State, b: State, increment: Increment
+    ) -> Coordinates | None:
         """A gradient plus `A(q_m)^T impulse`; `increment` has only these multipliers."""
         if self.system.nonholonomic is None:
             return gradient
-        return gradient + increment.impulse @ self.nonholonomic(0.5 * (a.q + b.q))
+        force = increment.impulse @ self.nonholonomic(0.5 * (a.q + b.q))
+        return force if gradient is None else gradient + force
 
     def has_slip_rate(self, increment: Increment) -> bool:
         """Whether nonholonomic constraints have multipliers at velocity level."""

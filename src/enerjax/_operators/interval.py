@@ -51,7 +51,8 @@ class Increment(eqx.Module):
 class Gradient(eqx.Module):
     """A gradient of the energy, including constraints, at a state or over an interval.
 
-    - `impulse`: `h dH/dq`, shape `(nq,)`; a generalised momentum.
+    - `impulse`: `h dH/dq`, shape `(nq,)`; a generalised momentum. `None` where all terms
+      are in `rows`.
     - `rate`: `dH/dp`, shape `(np,)`, a rate of the coordinates; empty where the velocities
       are eliminated.
     - `work`: `h dH/dt`, the work of the driven constraints (energy). `None` if there are
@@ -60,7 +61,7 @@ class Gradient(eqx.Module):
       not to coordinates: forces, and torques on rates. `None` if there are none.
     """
 
-    impulse: Coordinates
+    impulse: Coordinates | None
     rate: Float[Array, " np"]
     work: Scalar | None = None
     rows: Increments | None = None
@@ -72,9 +73,11 @@ class Gradient(eqx.Module):
         rows = -load if self.rows is None else self.rows - load
         return Gradient(self.impulse, self.rate, self.work, rows)
 
-    def plus(self, impulse: Coordinates, rows: Increments | None) -> "Gradient":
+    def plus(self, impulse: Coordinates | None, rows: Increments | None) -> "Gradient":
         """This gradient with further terms in the coordinates and in the rows."""
-        added = Gradient(self.impulse + impulse, self.rate, self.work, self.rows)
+        parts = [x for x in (self.impulse, impulse) if x is not None]
+        total = sum(parts[1:], parts[0]) if parts else None
+        added = Gradient(total, self.rate, self.work, self.rows)
         return added if rows is None else added.less(-rows)
 
 

@@ -13,7 +13,6 @@ for the velocities in closed form.
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -24,6 +23,7 @@ from .._discrete import (
     AbstractCorrected,
     AbstractDerivative,
     ChainRule,
+    RotationRule,
 )
 from .._solvers import (
     affine_root,
@@ -44,6 +44,7 @@ from .._system import (
     ByRates,
     Frames,
     mean_momentum,
+    Rates,
     State,
     System,
 )
@@ -65,20 +66,6 @@ from .elements import (
     Summands,
 )
 from .interval import Gradient, gradient_and_work, Increment, Scales, Time, time_rate
-
-
-class _Motion(NamedTuple):
-    """The points between which a discrete gradient is taken, positions or these with rates.
-
-    - `at`: the positions and the rates of a point.
-    - `parts`: the gradient with respect to the positions, and further rows, of a gradient
-      with respect to the points.
-    """
-
-    start: Array
-    end: Array
-    at: Callable[[Array], tuple[Coordinates, Coordinates]]
-    parts: Callable[[Array], tuple[Coordinates, Increments | None]]
 
 
 class SeparableModel(AbstractModel):
@@ -274,59 +261,81 @@ class SeparableModel(AbstractModel):
         *,
         is_step: bool,
     ) -> Gradient:
-        fixed, driven, nonholonomic = self.split(increment, a.q)
         step = h * increment.rate if is_step else None
         rule = self.chain_rule(derivative, step)
-        if rule is None:
-            motion = self._motion(a, b, h, increment, is_step)
-        else:
-            derivative, motion = rule, self._motion_with_rates(a, b)
-
-        constraint = lambda q: jnp.concatenate([self.fixed(q), self.coordinate(q)])
-        rate = lambda q, rates: jax.jvp(self.fixed, (q,), (rates,))[1]
-        slip_rate = lambda q, rates: self.nonholonomic(q) @ rates
-        has_slip_rate = self.has_slip_rate(nonholonomic)
-
-        def action(x: Array) -> Scalar:
-            q, rates = motion.at(x)
-            out = h * self._potential(q)
-            if fixed.impulse.size > 0:
-                out = out + fixed.impulse @ constraint(q)
-            if fixed.velocity_impulse.size > 0:
-                out = out + h * fixed.velocity_impulse @ rate(q, rates)
-            if has_slip_rate:
-                out = out + h * nonholonomic.velocity_impulse @ slip_rate(q, rates)
-            return out
-
-        def driven_action(x: Array, t: Time) -> Scalar:
-            q, rates = motion.at(x)
-            return self.driven_action(q, rates, t, h, driven)
+        if rule is not None:
+            return self._gradient_in_rows(rule, a, b, h, increment)
+        fixed, driven, nonholonomic = self.split(increment, a.q)
+        mean_rate, torque = self._mean_rates(a, b, h, increment, is_step)
+        action_of_rates = self._action(h, fixed, nonholonomic)
+        action = lambda q: action_of_rates(q, mean_rate(q))
+        driven_action = lambda q, t: self.driven_action(q, mean_rate(q), t, h, driven)
 
         with_time = None if self.system.driven is None else driven_action
-        ends = (motion.start, a.t), (motion.end, b.t)
-        none = jnp.zeros((0,), h.dtype)
+        ends, none = ((a.q, a.t), (b.q, b.t)), jnp.zeros((0,), h.dtype)
         energies = self._element_energies(a.q)
         if energies is None or not isinstance(derivative, AbstractCorrected):
             size = self.action_size(derivative, a, h, increment)
-            gradient, work = gradient_and_work(
+            impulse, work = gradient_and_work(
                 derivative, action, with_time, *ends, size=size
             )
-            impulse, torque = motion.parts(gradient)
             impulse = self.nonholonomic_impulse(impulse, a, b, nonholonomic)
             return Gradient(impulse, none, work, torque)
+        constraint = lambda q: jnp.concatenate([self.fixed(q), self.coordinate(q)])
         rows: list[Summands] = [lambda q, fn=fn: h * fn(q) for fn in energies]
         rows += [lambda q: fixed.impulse * constraint(q)]
         if fixed.velocity_impulse.size > 0:
-            rows += [lambda q: h * fixed.velocity_impulse * rate(*motion.at(q))]
-        if has_slip_rate:
+            eta = fixed.velocity_impulse
+            rows += [lambda q: h * eta * jax.jvp(self.fixed, (q,), (mean_rate(q),))[1]]
+        if self.has_slip_rate(nonholonomic):
             eta = nonholonomic.velocity_impulse
-            rows += [lambda q: h * eta * slip_rate(*motion.at(q))]
-        gradient, work = gradient_and_work_by_rows(derivative, rows, with_time, *ends)
-        impulse, torque = motion.parts(gradient)
+            rows += [lambda q: h * eta * (self.nonholonomic(q) @ mean_rate(q))]
+        impulse, work = gradient_and_work_by_rows(derivative, rows, with_time, *ends)
         if self.has_linear_potential:
             impulse = impulse + h * jax.grad(self._potential)(a.q)
         impulse = self.nonholonomic_impulse(impulse, a, b, nonholonomic)
         return Gradient(impulse, none, work, torque)
+
+    def _action(
+        self, h: Scalar, fixed: Increment, nonholonomic: Increment
+    ) -> Callable[[Coordinates, Coordinates], Scalar]:
+        """`h (V + lambda . Phi + eta . psi)` of coordinates and rates, without the driven
+        constraints."""
+
+        def action(q: Coordinates, rates: Coordinates) -> Scalar:
+            out = h * self._potential(q)
+            if fixed.impulse.size > 0:
+                rows = jnp.concatenate([self.fixed(q), self.coordinate(q)])
+                out = out + fixed.impulse @ rows
+            if fixed.velocity_impulse.size > 0:
+                psi = jax.jvp(self.fixed, (q,), (rates,))[1]
+                out = out + h * fixed.velocity_impulse @ psi
+            if self.has_slip_rate(nonholonomic):
+                psi = self.nonholonomic(q) @ rates
+                out = out + h * nonholonomic.velocity_impulse @ psi
+            return out
+
+        return action
+
+    def _gradient_in_rows(
+        self, rule: RotationRule, a: State, b: State, h: Scalar, increment: Increment
+    ) -> Gradient:
+        """The discrete gradient with respect to the rows of coordinates, rates and time
+        together."""
+        fixed, driven, nonholonomic = self.split(increment, a.q)
+        action = self._action(h, fixed, nonholonomic)
+
+        def both(x: tuple[Coordinates, Coordinates, Time]) -> Scalar:
+            q, rates, t = x
+            if self.system.driven is None:
+                return action(q, rates)
+            return action(q, rates) + self.driven_action(q, rates, t, h, driven)
+
+        at = lambda state: (state.q, self.lift(state.q, state.v), state.t)
+        rows, _, work = rule.gradient(both, at(a), at(b))
+        impulse = self.nonholonomic_impulse(None, a, b, nonholonomic)
+        work = None if self.system.driven is None else work
+        return Gradient(impulse, jnp.zeros((0,), h.dtype), work, rows)
 
     def structure(
         self, a: State, b: State, h: Scalar, rate: Increments, gradient: Gradient
@@ -339,9 +348,9 @@ class SeparableModel(AbstractModel):
             h * rate,
             self.args,
         )
-        balance = balance + self.kinematics.pull_back(
-            a.q, b.q, h * rate, gradient.impulse
-        )
+        if gradient.impulse is not None:
+            pulled = self.kinematics.pull_back(a.q, b.q, h * rate, gradient.impulse)
+            balance = balance + pulled
         if gradient.rows is not None:
             balance = balance + gradient.rows
         return balance, gradient.rate
@@ -351,33 +360,25 @@ class SeparableModel(AbstractModel):
 
     def chain_rule(
         self, derivative: AbstractDerivative, step: Increments | None
-    ) -> AbstractDerivative | None:
+    ) -> RotationRule | None:
         """The chain rule with respect to the rows, where a kind of coordinates has one and
         the discrete gradients are those of a step by the chain rule; else `None`."""
         if step is None or not isinstance(derivative, ChainRule):
             return None
         return self.kinematics.chain_rule(step)
 
-    def _motion(
+    def _mean_rates(
         self, a: State, b: State, h: Scalar, increment: Increment, is_step: bool
-    ) -> "_Motion":
-        """The positions, and the rates in the gradient of `psi` with respect to them."""
-        eta, mean = increment.velocity_impulse, 0.5 * (a.v + b.v)
+    ) -> tuple[Rates, Increments | None]:
+        """The rates in the gradient of `psi` with respect to `q`, and further rows."""
+        eta = increment.velocity_impulse
         if not is_step or eta.size == 0:
-            at = lambda q: (q, self.lift(q, mean))
-            return _Motion(a.q, b.q, at, lambda gradient: (gradient, None))
-        ends = lambda: tuple(self._by_rates((x.q, x.t), eta) for x in (a, b))
-        rates, rows = self.kinematics.mean_rates(a, b, self.lift, ends)
-        rows = None if rows is None else h * rows
-        at = lambda q: (q, rates(q))
-        return _Motion(a.q, b.q, at, lambda gradient: (gradient, rows))
-
-    def _motion_with_rates(self, a: State, b: State) -> "_Motion":
-        """Positions and rates together, for gradients with respect to the rows."""
-        size = a.q.size
-        ends = (jnp.concatenate([x.q, self.lift(x.q, x.v)]) for x in (a, b))
-        split = lambda x: (x[:size], x[size:])
-        return _Motion(*ends, split, lambda rows: (jnp.zeros_like(a.q), rows[:size]))
+            mean = 0.5 * (a.v + b.v)
+            return lambda q: self.lift(q, mean), None
+        at = lambda state: self._by_rates((state.q, state.t), eta)
+        by_rates = lambda: (at(a), at(b))
+        rates, rows = self.kinematics.mean_rates(a, b, self.lift, by_rates)
+        return rates, None if rows is None else h * rows
 
     def _reaction(
         self,
@@ -392,27 +393,16 @@ class SeparableModel(AbstractModel):
             return jnp.zeros((self.inertia.shape[0],), eta.dtype)
         rule = self.chain_rule(derivative, step)
         if rule is not None:
-            return self.inverse_inertia @ self._momentum_of_rates(rule, a, b, eta)
+            energy = lambda x: eta @ self.joint_rate(*x)
+            rest = jnp.zeros_like(a[0])  # rates enter linearly, so any will do
+            ends = (a[0], rest, a[1]), (b[0], rest, b[1])
+            return self.inverse_inertia @ rule.gradient(energy, *ends)[1]
         ends = self._by_rates(a, eta), self._by_rates(b, eta)
         if step is None:
             momentum = mean_momentum(*ends, self._lowered)
         else:
             momentum = self.kinematics.momentum_of_rates(*ends, step, self._lowered)
         return self.inverse_inertia @ momentum
-
-    def _momentum_of_rates(
-        self, rule: AbstractDerivative, a: Position, b: Position, eta: JointMultipliers
-    ) -> Velocities:
-        """The discrete gradient of `eta . psi` with respect to the rates."""
-        (qa, ta), (qb, tb) = a, b
-        size, rest = qa.size, jnp.zeros_like(qa)  # rates are linear, so any will do
-        if ta is None:
-            energy = lambda x: eta @ self.joint_rate(x[:size], x[size:], None)
-            ends = (jnp.concatenate([q, rest]) for q in (qa, qb))
-        else:
-            energy = lambda x: eta @ self.joint_rate(x[:size], x[size:-1], x[-1])
-            ends = (jnp.concatenate([q, rest, t[None]]) for q, t in (a, b))
-        return rule.gradient(energy, *ends)[size : 2 * size]
 
     def _by_rates(self, position: Position, eta: JointMultipliers) -> ByRates:
         """`B^T eta` of the joints: the gradient of `eta . psi` with respect to the rates

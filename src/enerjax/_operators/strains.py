@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .._discrete import AbstractDerivative, ChainRule, discrete_grad, discrete_jvp
+from .._discrete import ChainRule, discrete_grad, discrete_jvp
 from .._system import AbstractStrainEnergy, State
 from .._types import Coordinates, Increments, Scalar, Velocities
 from .base import row_scales
@@ -81,7 +81,8 @@ class Strains(eqx.Module):
         energy, ends = self._energy(None, y), ((qa, none), (qb, none))
         rule = self.model.chain_rule(ChainRule(), step)
         if rule is not None:
-            return _gradients(rule, energy, *ends)[1]
+            with_time = ((*end, None) for end in ends)
+            return rule.gradient(lambda x: energy(x[:2]), *with_time)[1]
         _, by_rates = discrete_grad(energy)(*ends)
         # The momenta of gradients with respect to rates are these themselves, except for
         # rotations, which do not use this function.
@@ -96,13 +97,14 @@ class Strains(eqx.Module):
         step: Increments,
         x: Float[Array, " ns"],
         y: Float[Array, " ns"],
-    ) -> tuple[Coordinates, Increments | None]:
+    ) -> tuple[Coordinates | None, Increments | None]:
         """The discrete gradient of `x . Gamma + y . dGamma/dt` in the coordinates, and
         further rows of the balance of momentum."""
         at = lambda state: (state.q, self.model.lift(state.q, state.v))
         energy, rule = self._energy(x, y), self.model.chain_rule(ChainRule(), step)
         if rule is not None:
-            return jnp.zeros_like(a.q), _gradients(rule, energy, at(a), at(b))[0]
+            of_both = lambda x: energy(x[:2])
+            return None, rule.gradient(of_both, (*at(a), None), (*at(b), None))[0]
         gradient, by_rates = discrete_grad(energy)(at(a), at(b))
         _, rows = self.model.kinematics.mean_rates(
             a, b, self.model.lift, lambda: ((a.q, by_rates), (b.q, by_rates))
@@ -129,16 +131,3 @@ class Strains(eqx.Module):
             return along if x is None else jnp.sum(x * values) + along
 
         return energy
-
-
-def _gradients(
-    rule: AbstractDerivative,
-    energy: Callable[[Motion], Scalar],
-    a: Motion,
-    b: Motion,
-) -> tuple[Increments, Velocities]:
-    """The parts for coordinates and for rates of a gradient with respect to the rows."""
-    size = a[0].size
-    of_both = lambda x: energy((x[:size], x[size:]))
-    found = rule.gradient(of_both, jnp.concatenate(a), jnp.concatenate(b))
-    return found[:size], found[size:]

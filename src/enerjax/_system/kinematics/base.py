@@ -26,7 +26,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
-from ..._discrete import AbstractDerivative
+from ..._discrete import RotationRule
 from ..._solvers import IndependentBlocks, solve_by_blocks, Symmetric
 from ..._types import (
     Args,
@@ -86,7 +86,7 @@ class AbstractKinematics(eqx.Module):
         """Whether a step uses velocities other than those of the user."""
         return False
 
-    def chain_rule(self, step: Increments) -> AbstractDerivative | None:
+    def chain_rule(self, step: Increments) -> RotationRule | None:
         """The chain rule over a step, with respect to the rows instead of the coordinates.
 
         It is for coordinates that are not linear in the steps. Then the discrete gradients

@@ -26,12 +26,12 @@ Rates of the axes, which enter constraints at velocity level, have rules of thei
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
-from ..._discrete import ANGLE, OTHER, RotationRule
+from ..._discrete import ANGLE, elementary, OTHER, RotationRule
 from ..._programs import Indices
 from ..._types import Increments
 from .plain import IdentityKinematics
+from .rigid_bodies import entries, joined
 
 
 class PlanarKinematics(IdentityKinematics):
@@ -72,10 +72,16 @@ class PlanarRotations(PlanarKinematics):
         )
 
     def displacement(self, q, step):
-        return step * _angle_over_tangent(self._half_turns(step))
+        table = self.table.array
+        others = np.setdiff1d(np.arange(step.size), table)
+        bodies = entries(step, table).reshape(-1, 3)
+        turned = 2 * jnp.arctan(0.5 * bodies[:, 2:])
+        moved = jnp.concatenate([bodies[:, :2], turned], axis=1).ravel()
+        return joined(moved, table, entries(step, others), others)
 
     def pull_back(self, qa, qb, step, gradient):
-        return gradient * _angle_over_tangent(self._half_turns(step))
+        half = self._half_turns(step)
+        return gradient * elementary.angle_ratio(half, jnp.ones_like(half))
 
     def chain_rule(self, step):
         return RotationRule(self._kinds(step.size), self._half_turns(step))
@@ -91,19 +97,3 @@ class PlanarRotations(PlanarKinematics):
         kinds = np.full(size, OTHER)
         kinds[self.table.array[:, 2]] = ANGLE
         return Indices(kinds)
-
-
-# The coefficients of `atan(x) / x` in `x^2`; below pi/16 they reach round-off.
-_SERIES = [(-1) ** k / (2 * k + 1) for k in range(12)]
-
-
-def _angle_over_tangent(t: Float[Array, " n"]) -> Float[Array, " n"]:
-    """`atan(t) / t`, without a choice: the angle is halved three times."""
-    factor = jnp.ones_like(t)
-    for _ in range(3):
-        growth = 1 / (1 + jnp.sqrt(1 + t * t))
-        t, factor = t * growth, factor * growth
-    square, series = t * t, jnp.zeros_like(t)
-    for coefficient in reversed(_SERIES):
-        series = series * square + coefficient
-    return 8 * factor * series

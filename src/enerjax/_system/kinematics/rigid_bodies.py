@@ -67,38 +67,38 @@ class RigidBodies(Indices):
 
     def pose(self, q: Coordinates) -> Pose:
         """The mass centres and directors of all bodies, or their rates or gradients."""
-        rows = _entries(q, self.q).reshape(-1, 12).T
+        rows = entries(q, self.q).reshape(-1, 12).T
         return rows[:3], rows[3:].reshape(3, 3, -1)
 
     def vectors(self, v: Velocities) -> tuple[Vector3, Vector3]:
         """The translational and the rotational parts of the velocities."""
-        rows = _entries(v, self.v).reshape(-1, 6).T
+        rows = entries(v, self.v).reshape(-1, 6).T
         return rows[:3], rows[3:]
 
     def coordinates(self, pose: Pose, others: Float[Array, " n"]) -> Coordinates:
         """The inverse of `pose`, with the values of the other coordinates."""
         centres, axes = pose
         rows = jnp.concatenate([centres, axes.reshape(9, -1)])
-        return _joined(rows.T.ravel(), self.q, others, self.other_q)
+        return joined(rows.T.ravel(), self.q, others, self.other_q)
 
     def velocities(
         self, moved: Vector3, turned: Vector3, others: Float[Array, " n"]
     ) -> Velocities:
         """The inverse of `vectors`, with the values of the other velocities."""
         rows = jnp.concatenate([moved, turned])
-        return _joined(rows.T.ravel(), self.v, others, self.other_v)
+        return joined(rows.T.ravel(), self.v, others, self.other_v)
 
     def others(self, q: Coordinates) -> Float[Array, " n"]:
         """The coordinates that belong to no rigid body."""
-        return _entries(q, self.other_q)
+        return entries(q, self.other_q)
 
     def other_rates(self, v: Velocities) -> Float[Array, " n"]:
         """The velocities that belong to no rigid body."""
-        return _entries(v, self.other_v)
+        return entries(v, self.other_v)
 
     def constraint(self, q: Coordinates) -> Float[Array, " 6*bodies"]:
         """The products of the directors less those of orthonormal ones, body by body."""
-        axes = _entries(q, self.q).reshape(-1, 4, 3)[:, 1:]
+        axes = entries(q, self.q).reshape(-1, 4, 3)[:, 1:]
         products = jnp.sum(axes[:, _LEFT] * axes[:, _RIGHT], axis=2)
         return (products - jnp.asarray(_LEFT == _RIGHT, q.dtype)[None]).ravel()
 
@@ -115,7 +115,7 @@ class RigidBodies(Indices):
 _LEFT, _RIGHT = np.array([0, 1, 2, 1, 2, 0]), np.array([0, 1, 2, 2, 0, 1])
 
 
-def _entries(x: Array, index: np.ndarray) -> Array:
+def entries(x: Array, index: np.ndarray) -> Array:
     """`x[index]`, which is a slice if the indices are consecutive."""
     flat = index.ravel()
     if flat.size == 0:
@@ -125,7 +125,7 @@ def _entries(x: Array, index: np.ndarray) -> Array:
     return x[flat]
 
 
-def _joined(x: Array, at: np.ndarray, y: Array, others: np.ndarray) -> Array:
+def joined(x: Array, at: np.ndarray, y: Array, others: np.ndarray) -> Array:
     """The entries of `x` at the indices `at`, and those of `y` at `others`."""
     places = np.concatenate([at.ravel(), others])
     both = x if others.size == 0 else jnp.concatenate([x, y])
