@@ -48,10 +48,11 @@ from . import elementary
 from .chain_rule import valid_increment
 from .fallback import fallback
 from .rules import RULES
-from .transform import moves, Moving, Value, Walk
+from .transform import increment, moves, Moving, Value, Walk
 
 
-# Coordinates, their rates, and the time.
+# Coordinates and the time; coordinates, their rates, and the time.
+Position: TypeAlias = tuple[Array, Array | None]
 Motion: TypeAlias = tuple[Array, Array, Array | None]
 
 # What a number is. A constant may stand for an angle or a rate that does not change.
@@ -104,13 +105,28 @@ class RotationRule(eqx.Module):
         time add up to the change of the function. The time may be `None`.
         """
         program = jax.make_jaxpr(fn)(a)
-
-        def push(d: Motion) -> Scalar:
-            (out,) = _Walk(RULES, fallback).closed(program, self._inputs(a, b, d))
-            return valid_increment(as_moving(out) if isinstance(out, Turning) else out)
-
+        push = lambda d: valid_increment(self._output(program, a, b, d))
         value, pull = jax.vjp(push, jax.tree.map(jnp.zeros_like, a))
         return pull(jnp.ones_like(value))[0]
+
+    def gradient_by_rates(
+        self, fn: Callable[[Motion], Scalar], a: Position, b: Position
+    ) -> Array:
+        """The part of `gradient` for the rates, of a function that is linear in them.
+
+        It does not depend on the rates. `a` and `b` are coordinates and times.
+        """
+        none = jnp.zeros_like(a[0])  # any rates will do
+        ends = (a[0], none, a[1]), (b[0], none, b[1])
+        program = jax.make_jaxpr(fn)(ends[0])
+        rest = jax.tree.map(jnp.zeros_like, ends[0])
+        push = lambda d: increment(self._output(program, *ends, (rest[0], d, rest[2])))
+        value, pull = jax.vjp(push, none)
+        return pull(jnp.ones_like(value))[0]
+
+    def _output(self, program: Any, a: Motion, b: Motion, d: Motion) -> Value:
+        (out,) = _Walk(RULES, fallback).closed(program, self._inputs(a, b, d))
+        return as_moving(out) if isinstance(out, Turning) else out
 
     def _inputs(self, a: Motion, b: Motion, d: Motion) -> list[Value]:
         kinds = self.kinds.array

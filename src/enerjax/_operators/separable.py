@@ -394,9 +394,7 @@ class SeparableModel(AbstractModel):
         rule = self.chain_rule(derivative, step)
         if rule is not None:
             energy = lambda x: eta @ self.joint_rate(*x)
-            rest = jnp.zeros_like(a[0])  # rates enter linearly, so any will do
-            ends = (a[0], rest, a[1]), (b[0], rest, b[1])
-            return self.inverse_inertia @ rule.gradient(energy, *ends)[1]
+            return self.inverse_inertia @ rule.gradient_by_rates(energy, a, b)
         ends = self._by_rates(a, eta), self._by_rates(b, eta)
         if step is None:
             momentum = mean_momentum(*ends, self._lowered)

@@ -81,8 +81,8 @@ class Strains(eqx.Module):
         energy, ends = self._energy(None, y), ((qa, none), (qb, none))
         rule = self.model.chain_rule(ChainRule(), step)
         if rule is not None:
-            with_time = ((*end, None) for end in ends)
-            return rule.gradient(lambda x: energy(x[:2]), *with_time)[1]
+            of_both = lambda x: energy(x[:2])
+            return rule.gradient_by_rates(of_both, (qa, None), (qb, None))
         _, by_rates = discrete_grad(energy)(*ends)
         # The momenta of gradients with respect to rates are these themselves, except for
         # rotations, which do not use this function.
