@@ -31,7 +31,7 @@ from ..._discrete import ANGLE, elementary, OTHER, RotationRule
 from ..._programs import Indices
 from ..._types import Increments
 from .plain import IdentityKinematics
-from .rigid_bodies import entries, joined
+from .rigid_bodies import check_indices, entries, joined
 
 
 class PlanarKinematics(IdentityKinematics):
@@ -49,6 +49,7 @@ class PlanarKinematics(IdentityKinematics):
         dtype, size = inertia.dtype, inertia.shape[0]
         probe = jnp.cos(jnp.arange(1, size + 1, dtype=dtype))
         table = self.table.array
+        check_indices(table, size)
         across, signs = np.arange(size), np.ones(size)
         across[table[:, :2]] = table[:, 1::-1]
         signs[table[:, 0]] = -1

@@ -24,8 +24,8 @@ def body_table(rigid_bodies: Any) -> Indices:
         raise ValueError(
             "`System(rigid_bodies=...)` must hold the indices of the twelve coordinates of "
             "each body (its mass centre, then its three axes), integers of shape "
-            "(bodies, 12), or in the plane of three (its mass centre, then its angle), "
-            f"shape (bodies, 3); got shape {table.shape} of {table.dtype}."
+            f"(bodies, 12); got shape {table.shape} of {table.dtype}. In the plane a body "
+            "has three (its mass centre, then its angle), shape (bodies, 3)."
         )
     if table.min(initial=0) < 0 or np.unique(table).size != table.size:
         raise ValueError(
@@ -33,6 +33,17 @@ def body_table(rigid_bodies: Any) -> Indices:
             "to two bodies or twice to one."
         )
     return Indices(table)
+
+
+def check_indices(table: np.ndarray, size: int) -> None:
+    """Raises a `ValueError` if a body has coordinates that do not exist."""
+    if table.max(initial=-1) >= size:
+        of = "the three axes" if table.shape[1] == 12 else "the angle"
+        raise ValueError(
+            f"`System(rigid_bodies=...)` holds the index {table.max()}, but `q` has {size} "
+            f"entries, with the indices 0 to {size - 1}. Each row holds the indices of the "
+            f"mass centre and of {of} of a body."
+        )
 
 
 class RigidBodies(Indices):
@@ -49,12 +60,7 @@ class RigidBodies(Indices):
     def __init__(self, table: Sequence[Sequence[int]] | np.ndarray, size: int):
         super().__init__(np.append(np.ravel(table), size))
         self.q = np.asarray(table).reshape(-1, 12)
-        if self.q.max(initial=-1) >= size:
-            raise ValueError(
-                f"`System(rigid_bodies=...)` holds the index {self.q.max()}, but `q` has "
-                f"{size} entries, with the indices 0 to {size - 1}. Each row holds the "
-                "indices of the mass centre and of the three axes of a body."
-            )
+        check_indices(self.q, size)
         self.other_q = np.setdiff1d(np.arange(size), self.q)
         firsts = np.concatenate([self.q[:, 0], self.other_q])
         counts = np.repeat([6, 1], [len(self.q), self.other_q.size])
