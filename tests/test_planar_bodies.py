@@ -1,4 +1,4 @@
-"""Bodies in the plane: energy, linear and angular momentum of all schemes that keep them."""
+"""Bodies in the plane: energy, linear and angular momentum of schemes that keep them."""
 
 import functools
 
@@ -16,7 +16,7 @@ from enerjax._programs import Indices
 from .helpers import EPS, follow, slopes
 
 
-# The chain rule over a rotation --------------------------------------------------------------
+# The chain rule over a rotation -----------------------------------------------------------
 
 
 def axes(angle):
@@ -28,7 +28,7 @@ def across(u, v):
     return u[0] * v[1] - u[1] * v[0]
 
 
-# Functions of two bodies `(x, y, angle)` that do not change when both turn about the origin.
+# Functions of two bodies `(x, y, angle)` that do not change when both turn together.
 INVARIANTS = dict(
     points=lambda q: jnp.sum((q[3:5] - q[:2] + axes(q[5])[0] - axes(q[2])[1]) ** 2),
     distance=lambda q: jnp.sqrt(jnp.sum((q[3:5] + 3 * axes(q[5])[0] - q[:2]) ** 2)),
@@ -217,7 +217,7 @@ def test_other_discrete_gradients_keep_the_energy(derivative):
     np.testing.assert_allclose(np.ptp(sol.audit.energy), 0.0, atol=1e-12 * size)
 
 
-# A system of two rods on a pin, which fly freely -----------------------------------------------
+# Two rods on a pin, which fly freely ------------------------------------------------------
 
 HALF = np.array([0.5, 0.8])
 MASS, INERTIA = np.array([1.0, 2.0]), np.array([0.1, 0.4])
@@ -274,7 +274,7 @@ def two_rods():
 
 
 @pytest.mark.parametrize(
-    "scheme, order, steps",
+    ("scheme", "order", "steps"),
     [
         (ej.EnergyPreserving(), 2, (40, 80, 160)),
         pytest.param(
@@ -346,6 +346,7 @@ def test_a_body_that_turns_freely_is_late_by_the_formula_of_cayley(spin):
         np.testing.assert_allclose(late, spin**2 / 12, rtol=spin**2)  # truncation
 
 
+@pytest.mark.slow
 def test_a_drive_by_more_than_half_a_turn_in_a_step_fails():
     scene = ej.Scene(
         [
