@@ -131,11 +131,10 @@ class RotationRule(eqx.Module):
     def _inputs(self, a: Motion, b: Motion, d: Motion) -> list[Value]:
         kinds = self.kinds.array
         of_rates = np.where(kinds == ANGLE, RATE, kinds)
-        parts = [
-            turning(a[k], b[k], d[k], self.half, d[0], own)
-            for k, own in enumerate((kinds, of_rates))
-        ]
-        return parts if a[2] is None else [*parts, Moving(a[2], b[2], d[2])]
+        coordinates = turning(a[0], b[0], d[0], self.half, d[0], kinds)
+        parts = [coordinates, turning(a[1], b[1], d[1], self.half, d[0], of_rates)]
+        ends = a[2], b[2], d[2]
+        return parts if any(t is None for t in ends) else [*parts, Moving(*ends)]
 
 
 class _Walk(Walk):
@@ -192,7 +191,8 @@ def _moved(primitive: Any, values: list[Value], params: dict[str, Any]) -> list 
     fields = [each(field, evaluate) for field in range(6)]
     kinds = [np.asarray(x).astype(int) for x in each(6, moved)]
     (factor,) = factors
-    return [_joined(Turning(*out, factor)) for out in zip(*fields, kinds, strict=True)]
+    joined = [Turning(*out, factor=factor) for out in zip(*fields, kinds, strict=True)]
+    return list(map(_joined, joined))
 
 
 def _moves(value: Value) -> bool:
@@ -262,7 +262,7 @@ def _sum(primitive: Any, values: list[Value], params: dict[str, Any]) -> list | 
     return [Moving(a, b, ratio * (x.d - y.d))]
 
 
-def _end(value: Value, k: int) -> Array:
+def _end(value: Value, k: int) -> Any:
     return value[k] if isinstance(value, Moving | Turning) else value
 
 

@@ -407,13 +407,13 @@ class AbstractModel(eqx.Module):
         return self.nonholonomic(0.5 * (qa + qb)) @ displacement
 
     def nonholonomic_impulse(
-        self, gradient: Coordinates | None, a: State, b: State, increment: Increment
-    ) -> Coordinates | None:
+        self, gradient: Coordinates, a: State, b: State, increment: Increment
+    ) -> Coordinates:
         """A gradient plus `A(q_m)^T impulse`; `increment` has only these multipliers."""
         if self.system.nonholonomic is None:
             return gradient
         force = increment.impulse @ self.nonholonomic(0.5 * (a.q + b.q))
-        return force if gradient is None else gradient + force
+        return gradient + force if gradient.size > 0 else force
 
     def has_slip_rate(self, increment: Increment) -> bool:
         """Whether nonholonomic constraints have multipliers at velocity level."""

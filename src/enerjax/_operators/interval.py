@@ -51,8 +51,8 @@ class Increment(eqx.Module):
 class Gradient(eqx.Module):
     """A gradient of the energy, including constraints, at a state or over an interval.
 
-    - `impulse`: `h dH/dq`, shape `(nq,)`; a generalised momentum. `None` where all terms
-      are in `rows`.
+    - `impulse`: `h dH/dq`, shape `(nq,)`; a generalised momentum. Empty where all terms are
+      in `rows`.
     - `rate`: `dH/dp`, shape `(np,)`, a rate of the coordinates; empty where the velocities
       are eliminated.
     - `work`: `h dH/dt`, the work of the driven constraints (energy). `None` if there are
@@ -61,7 +61,7 @@ class Gradient(eqx.Module):
       not to coordinates: forces, and torques on rates. `None` if there are none.
     """
 
-    impulse: Coordinates | None
+    impulse: Coordinates
     rate: Float[Array, " np"]
     work: Scalar | None = None
     rows: Increments | None = None
@@ -73,10 +73,9 @@ class Gradient(eqx.Module):
         rows = -load if self.rows is None else self.rows - load
         return Gradient(self.impulse, self.rate, self.work, rows)
 
-    def plus(self, impulse: Coordinates | None, rows: Increments | None) -> "Gradient":
+    def plus(self, impulse: Coordinates, rows: Increments | None) -> "Gradient":
         """This gradient with further terms in the coordinates and in the rows."""
-        parts = [x for x in (self.impulse, impulse) if x is not None]
-        total = sum(parts[1:], parts[0]) if parts else None
+        total = self.impulse + impulse if impulse.size > 0 else self.impulse
         added = Gradient(total, self.rate, self.work, self.rows)
         return added if rows is None else added.less(-rows)
 

@@ -333,7 +333,7 @@ class SeparableModel(AbstractModel):
 
         at = lambda state: (state.q, self.lift(state.q, state.v), state.t)
         rows, _, work = rule.gradient(both, at(a), at(b))
-        impulse = self.nonholonomic_impulse(None, a, b, nonholonomic)
+        impulse = self.nonholonomic_impulse(a.q[:0], a, b, nonholonomic)
         work = None if self.system.driven is None else work
         return Gradient(impulse, jnp.zeros((0,), h.dtype), work, rows)
 
@@ -348,7 +348,7 @@ class SeparableModel(AbstractModel):
             h * rate,
             self.args,
         )
-        if gradient.impulse is not None:
+        if gradient.impulse.size > 0:
             pulled = self.kinematics.pull_back(a.q, b.q, h * rate, gradient.impulse)
             balance = balance + pulled
         if gradient.rows is not None:

@@ -97,14 +97,14 @@ class Strains(eqx.Module):
         step: Increments,
         x: Float[Array, " ns"],
         y: Float[Array, " ns"],
-    ) -> tuple[Coordinates | None, Increments | None]:
+    ) -> tuple[Coordinates, Increments | None]:
         """The discrete gradient of `x . Gamma + y . dGamma/dt` in the coordinates, and
         further rows of the balance of momentum."""
         at = lambda state: (state.q, self.model.lift(state.q, state.v))
         energy, rule = self._energy(x, y), self.model.chain_rule(ChainRule(), step)
         if rule is not None:
             of_both = lambda x: energy(x[:2])
-            return None, rule.gradient(of_both, (*at(a), None), (*at(b), None))[0]
+            return a.q[:0], rule.gradient(of_both, (*at(a), None), (*at(b), None))[0]
         gradient, by_rates = discrete_grad(energy)(at(a), at(b))
         _, rows = self.model.kinematics.mean_rates(
             a, b, self.model.lift, lambda: ((a.q, by_rates), (b.q, by_rates))

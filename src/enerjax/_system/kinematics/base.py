@@ -82,10 +82,11 @@ class AbstractKinematics(eqx.Module):
         """Whether `L = I`, and steps are added to the coordinates."""
 
     @property
+    @abc.abstractmethod
     def has_own_velocities(self) -> bool:
         """Whether a step uses velocities other than those of the user."""
-        return False
 
+    @abc.abstractmethod
     def chain_rule(self, step: Increments) -> RotationRule | None:
         """The chain rule over a step, with respect to the rows instead of the coordinates.
 
@@ -93,7 +94,6 @@ class AbstractKinematics(eqx.Module):
         of functions of coordinates and rates are taken in both together. `None` where the
         chain rule in the coordinates conserves momenta.
         """
-        return None
 
     @abc.abstractmethod
     def has_inertia(self, energy: KineticEnergy, inertia: Symmetric) -> Flag:
@@ -282,7 +282,11 @@ def mean_momentum(a: ByRates, b: ByRates, lowered: Lowered) -> Velocities:
 
 
 class AbstractFlatKinematics(AbstractKinematics):
-    """A kind of coordinates to which steps are added; its velocities are the user's."""
+    """A kind of coordinates whose velocities are the user's."""
+
+    @property
+    def has_own_velocities(self):
+        return False
 
     def velocity(self, q, v):
         return v
@@ -296,15 +300,22 @@ class AbstractFlatKinematics(AbstractKinematics):
     def coordinate_scale(self, step):
         return step
 
-    def displacement(self, q, step):
-        return step
-
-    def pull_back(self, qa, qb, step, gradient):
-        return gradient
-
     def mean_rates(self, a, b, lift, by_rates):
         mean = 0.5 * (a.v + b.v)
         return lambda q: lift(q, mean), None
 
     def momentum_of_rates(self, a, b, step, lowered):
         return mean_momentum(a, b, lowered)
+
+
+class AbstractAddedKinematics(AbstractFlatKinematics):
+    """A kind of coordinates to which steps are added."""
+
+    def displacement(self, q, step):
+        return step
+
+    def pull_back(self, qa, qb, step, gradient):
+        return gradient
+
+    def chain_rule(self, step):
+        return None

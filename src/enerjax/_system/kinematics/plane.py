@@ -30,18 +30,19 @@ import numpy as np
 from ..._discrete import ANGLE, elementary, OTHER, RotationRule
 from ..._programs import Indices
 from ..._types import Increments
-from .plain import IdentityKinematics
+from .base import AbstractAddedKinematics
+from .plain import AbstractIndependentKinematics
 from .rigid_bodies import check_indices, entries, joined
 
 
-class PlanarKinematics(IdentityKinematics):
-    """`v = qdot`, with steps in the angle of each body.
+class AbstractPlanarKinematics(AbstractIndependentKinematics):
+    """`v = qdot` of bodies in the plane.
 
     - `table`: the indices of the coordinates of each body, shape `(bodies, 3)`; see
       `body_table`.
     """
 
-    table: Indices = eqx.field(static=True)
+    table: eqx.AbstractVar[Indices]
 
     def has_inertia(self, energy, inertia):
         # The mass of a body is the same along both axes, and turning it moves no mass
@@ -58,19 +59,23 @@ class PlanarKinematics(IdentityKinematics):
         size = bound @ (inertia.diagonal() * bound)
         return jnp.abs(energy(probe) - energy(other)) <= 1e3 * jnp.finfo(dtype).eps * size
 
+
+class PlanarKinematics(AbstractPlanarKinematics, AbstractAddedKinematics):
+    """Bodies in the plane with steps in their angles."""
+
+    table: Indices = eqx.field(static=True)
+
     def with_rotations(self, q, dimensions):
         return PlanarRotations(self.table) if 2 in dimensions else self
 
 
-class PlanarRotations(PlanarKinematics):
-    """`v = qdot`, with Cayley's rotation of each body in a step."""
+class PlanarRotations(AbstractPlanarKinematics):
+    """Bodies in the plane, which a step turns by Cayley's rotation."""
 
-    def describe(self, q, v):
-        others = q.size - self.table.array.size
-        return (
-            f"{len(self.table.array)} rigid bodies in the plane, each moved by a "
-            "translation and a rotation" + (f", and {others} others" if others > 0 else "")
-        )
+    table: Indices = eqx.field(static=True)
+
+    def with_rotations(self, q, dimensions):
+        return self
 
     def displacement(self, q, step):
         table = self.table.array

@@ -148,6 +148,9 @@ class RigidKinematics(AbstractKinematics):
     def pull_back(self, qa, qb, step, gradient):
         return self.pull(qa, qb, gradient, None)
 
+    def chain_rule(self, step):
+        return None
+
     def push(self, qa, qb, step, args):
         return step
 
