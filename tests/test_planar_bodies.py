@@ -157,7 +157,6 @@ def momenta(system, ys, args):
     return np.stack([p[:, x].sum(axis=1), p[:, y].sum(axis=1)]), angular, size
 
 
-@functools.cache
 def run_of_everything(scheme, h=0.02):
     system, start, args = everything().build()
     sol = ej.simulate(system, scheme, start, args, h=h, num_steps=60)
@@ -278,7 +277,7 @@ def two_rods():
     [
         (ej.EnergyPreserving(), 2, (40, 80, 160)),
         pytest.param(
-            ej.Composed(ej.EnergyPreserving(), 4), 4, (10, 20, 40), marks=pytest.mark.slow
+            ej.Composed(ej.EnergyPreserving(), 4), 4, (20, 40, 80), marks=pytest.mark.slow
         ),
     ],
     ids=["2", "4"],

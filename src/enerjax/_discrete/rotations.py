@@ -133,8 +133,9 @@ class RotationRule(eqx.Module):
         of_rates = np.where(kinds == ANGLE, RATE, kinds)
         coordinates = turning(a[0], b[0], d[0], self.half, d[0], kinds)
         parts = [coordinates, turning(a[1], b[1], d[1], self.half, d[0], of_rates)]
-        ends = a[2], b[2], d[2]
-        return parts if any(t is None for t in ends) else [*parts, Moving(*ends)]
+        if a[2] is None or b[2] is None or d[2] is None:
+            return parts
+        return [*parts, Moving(a[2], b[2], d[2])]
 
 
 class _Walk(Walk):
