@@ -158,8 +158,8 @@ FAULTS = (
     Fault(
         "strains: rates at one end",
         "_operators/strains.py",
-        "discrete_grad(self._energy(x, y))(at(a), at(b))",
-        "discrete_grad(self._energy(x, y))(at(a), (b.q, at(a)[1]))",
+        "discrete_grad(energy)(at(a), at(b))",
+        "discrete_grad(energy)(at(a), (b.q, at(a)[1]))",
         "The terms of the strain rates are not those of the velocities at both ends.",
         of("energy_momentum_decaying"),
     ),

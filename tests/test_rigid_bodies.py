@@ -114,7 +114,7 @@ def test_pulled_gradients_have_the_work_of_the_gradients(table):
     step = Step(table)
     for _ in range(5):
         gradient = step.random(step.qa.size)
-        rows = step.kinematics.pull_back(step.qa, step.qb, gradient)
+        rows = step.kinematics.pull_back(step.qa, step.qb, step.step, gradient)
         near(rows @ step.step, gradient @ (step.qb - step.qa), 10)
         # A force of the user, conjugate to the rates of the coordinates, has the same rows.
         rows = step.kinematics.pull(step.qa, step.qb, gradient, None)
@@ -141,7 +141,7 @@ def test_functions_of_inner_products_exert_no_torque_in_space(table):
     by_vector[0, 0] -= by_vector[:, 0].sum(axis=0)
     gradient = np.zeros_like(step.qa)
     gradient[bodies.q] = by_vector.reshape(-1, 12)
-    rows = np.asarray(step.kinematics.pull_back(step.qa, step.qb, gradient))
+    rows = np.asarray(step.kinematics.pull_back(step.qa, step.qb, step.step, gradient))
     torque = np.zeros(3)
     middle = (step.qa + step.qb) / 2
     for body, v in enumerate(bodies.v):

@@ -158,7 +158,7 @@ def test_forces_that_functions_define_follow_closed_forms():
     scene = pushed()
     system, start, args = scene.build()
     run = on_host(
-        ej.simulate(system, ej.EnergyPreserving(), start, args, h=5e-3, num_steps=400)
+        ej.simulate(system, ej.EnergyPreserving(), start, args, h=2.5e-3, num_steps=800)
     )
     t = run.ts
     sine = 0.7 / 3 * (t - np.sin(3 * t) / 3)

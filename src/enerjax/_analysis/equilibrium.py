@@ -185,7 +185,7 @@ def _solve(
     rotates: bool,
     is_near: bool,
 ) -> tuple[Equilibrium, Scalar, Flag]:
-    model = make_model(system, guess, args, rotates=rotates)
+    model = make_model(system, guess, args, rotates_in=(3,) if rotates else ())
     guess = model.to_internal(guess)
     scales, size = model.scales, _force_size(model, guess)
     q0, unit = guess.q, size / scales.step

@@ -1,3 +1,4 @@
+from . import elementary as elementary
 from .base import AbstractDerivative as AbstractDerivative
 from .chain_rule import (
     ChainRule as ChainRule,
@@ -11,3 +12,4 @@ from .corrected import (
     Gonzalez as Gonzalez,
     MeanValue as MeanValue,
 )
+from .rotations import ANGLE as ANGLE, OTHER as OTHER, RotationRule as RotationRule

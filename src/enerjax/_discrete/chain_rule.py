@@ -115,12 +115,12 @@ def _traced(
     def push(d: PyTree[Array], walk: Walk) -> PyTree[Array]:
         inputs = list(map(Moving, flat_a, flat_b, structure.flatten_up_to(d)))
         outs = walk.closed(program, inputs)
-        return out_structure.unflatten([_valid_increment(x) for x in outs])
+        return out_structure.unflatten([valid_increment(x) for x in outs])
 
     return push
 
 
-def _valid_increment(value: Value) -> Array:
+def valid_increment(value: Value) -> Array:
     """The increment of an output; NaN if the output is not finite at one of the points.
 
     A difference quotient can be finite where the function is not defined, such as that of

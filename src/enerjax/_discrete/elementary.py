@@ -18,7 +18,7 @@ Quotient = Callable[[Array, Array], Array]
 
 # The series of `atan x / x` and `atanh x / x` are used below this argument. There 16 terms
 # reach round-off: the next is 0.25^32 / 33, about 2e-21.
-_SMALL_RATIO = 0.25
+SMALL_RATIO = 0.25
 _TERMS_OF_ATAN = 16
 # Those of `sin x / x` and `sinh x / x` are used below 1, where 11 terms reach round-off:
 # the next is 1 / 23!, about 4e-23.
@@ -112,11 +112,11 @@ def log1p(a: Array, b: Array) -> Array:
 
 def _log_ratio(d: Array, total: Array, change: Array) -> Array:
     """The quotient of `log`, from the difference and the sum of its arguments."""
-    near = jnp.abs(d) < _SMALL_RATIO * jnp.abs(total)
-    return _series_or_quotient(near, d, total, lambda x: 2 * _atanhc(x), change)
+    near = jnp.abs(d) < SMALL_RATIO * jnp.abs(total)
+    return series_or_quotient(near, d, total, lambda x: 2 * _atanhc(x), change)
 
 
-def _series_or_quotient(
+def series_or_quotient(
     near: Array, d: Array, total: Array, series: Callable[[Array], Array], change: Array
 ) -> Array:
     """`series(d / total) / total` where `near`, else `change / d`."""
@@ -185,19 +185,19 @@ def atan(a: Array, b: Array) -> Array:
 
 def atanh(a: Array, b: Array) -> Array:
     d, total = b - a, 1 - a * b
-    near = jnp.abs(d) < _SMALL_RATIO * jnp.abs(total)
+    near = jnp.abs(d) < SMALL_RATIO * jnp.abs(total)
     # Beyond 1 this is the quotient of the inverse of coth, which has the same slope.
     inside = lambda x: jnp.arctanh(
         jnp.where(jnp.abs(x) > 1, 1 / jnp.where(x == 0, 1, x), x)
     )
-    return _series_or_quotient(near, d, total, _atanhc, inside(b) - inside(a))
+    return series_or_quotient(near, d, total, _atanhc, inside(b) - inside(a))
 
 
 def angle_ratio(cross: Array, dot: Array) -> Array:
     """The angle `atan2(cross, dot)` over `cross`."""
-    near = jnp.abs(cross) < _SMALL_RATIO * dot
+    near = jnp.abs(cross) < SMALL_RATIO * dot
     angle = jnp.arctan2(jnp.where(near, 0, cross), jnp.where(near, 1, dot))
-    return _series_or_quotient(near, cross, dot, _atanc, angle)
+    return series_or_quotient(near, cross, dot, atanc, angle)
 
 
 def absolute(a: Array, b: Array) -> Array:
@@ -232,15 +232,29 @@ def smooth(function: Callable[[Array], Array], reach: float) -> Quotient:
 
 
 def _even(series: Sequence[float]) -> Callable[[Array], Array]:
-    """An even function near zero, by its series in `x**2`."""
+    """An even function near zero, by its series in `x**2`.
 
+    Its derivative has a series of its own, so that it is one number for all directions.
+    """
+    slopes = [2 * k * coefficient for k, coefficient in enumerate(series)][1:]
+
+    @jax.custom_jvp
     def function(x: Array) -> Array:
-        square, total = x * x, jnp.zeros_like(x)
-        for coefficient in reversed(series):
-            total = total * square + coefficient
-        return total
+        return _polynomial(series, x * x)
+
+    @function.defjvp
+    def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+        (x,), (d,) = primals, tangents
+        return function(x), x * _polynomial(slopes, x * x) * d
 
     return function
+
+
+def _polynomial(coefficients: Sequence[float], x: Array) -> Array:
+    total = jnp.full_like(x, coefficients[-1])
+    for coefficient in reversed(coefficients[:-1]):
+        total = total * x + coefficient
+    return total
 
 
 def _factorials(sign: int) -> list[float]:
@@ -253,5 +267,5 @@ def _odd_numbers(sign: int) -> list[float]:
 
 _sinc = _even(_factorials(-1))
 _sinhc = _even(_factorials(1))
-_atanc = _even(_odd_numbers(-1))
+atanc = _even(_odd_numbers(-1))
 _atanhc = _even(_odd_numbers(1))

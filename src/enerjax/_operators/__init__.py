@@ -15,13 +15,18 @@ from .strains import Strains as Strains
 
 
 def make_model(
-    system: AbstractSystem, state: State, args: Args, *, rotates: bool = False
+    system: AbstractSystem,
+    state: State,
+    args: Args,
+    *,
+    rotates_in: tuple[int, ...] = (),
 ) -> AbstractModel:
     """The model of a system. The scales are those at `state`, which is a user's state.
 
-    With `rotates`, rigid bodies are moved by rotations; see `SeparableModel`.
+    Rigid bodies in the dimensions `rotates_in` are moved by rotations; see
+    `SeparableModel`.
     """
     if isinstance(system, AbstractCanonicalSystem):
         return CanonicalModel(system, state, args)
     assert isinstance(system, System)
-    return SeparableModel(system, state, args, rotates=rotates)
+    return SeparableModel(system, state, args, rotates_in=rotates_in)

@@ -156,6 +156,7 @@ class AbstractModel(eqx.Module):
         self,
         unknowns: tuple[Float[Array, " np"], ...],
         velocities: Callable[[Reaction], tuple[Velocities, ...]],
+        derivative: AbstractDerivative,
         step: Increments | None,
     ) -> tuple[Velocities, ...]:
         """The field `v` of the states at the nodes of a step.
@@ -412,7 +413,8 @@ class AbstractModel(eqx.Module):
         """A gradient plus `A(q_m)^T impulse`; `increment` has only these multipliers."""
         if self.system.nonholonomic is None:
             return gradient
-        return gradient + increment.impulse @ self.nonholonomic(0.5 * (a.q + b.q))
+        force = increment.impulse @ self.nonholonomic(0.5 * (a.q + b.q))
+        return gradient + force if gradient.size > 0 else force
 
     def has_slip_rate(self, increment: Increment) -> bool:
         """Whether nonholonomic constraints have multipliers at velocity level."""

@@ -94,6 +94,7 @@ class CanonicalModel(AbstractModel):
         self,
         unknowns: tuple[Float[Array, " np"], ...],
         velocities: Callable[[Reaction], tuple[Velocities, ...]],
+        derivative: AbstractDerivative,
         step: Coordinates | None,
     ) -> tuple[Velocities, ...]:
         return unknowns

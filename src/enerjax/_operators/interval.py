@@ -51,7 +51,8 @@ class Increment(eqx.Module):
 class Gradient(eqx.Module):
     """A gradient of the energy, including constraints, at a state or over an interval.
 
-    - `impulse`: `h dH/dq`, shape `(nq,)`; a generalised momentum.
+    - `impulse`: `h dH/dq`, shape `(nq,)`; a generalised momentum. Empty where all terms are
+      in `rows`.
     - `rate`: `dH/dp`, shape `(np,)`, a rate of the coordinates; empty where the velocities
       are eliminated.
     - `work`: `h dH/dt`, the work of the driven constraints (energy). `None` if there are
@@ -74,7 +75,8 @@ class Gradient(eqx.Module):
 
     def plus(self, impulse: Coordinates, rows: Increments | None) -> "Gradient":
         """This gradient with further terms in the coordinates and in the rows."""
-        added = Gradient(self.impulse + impulse, self.rate, self.work, self.rows)
+        total = self.impulse + impulse if impulse.size > 0 else self.impulse
+        added = Gradient(total, self.rate, self.work, self.rows)
         return added if rows is None else added.less(-rows)
 
 

@@ -19,7 +19,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._discrete import AbstractCorrected, AbstractDerivative
+from .._discrete import (
+    AbstractCorrected,
+    AbstractDerivative,
+    ChainRule,
+    RotationRule,
+)
 from .._solvers import (
     affine_root,
     as_dense,
@@ -66,8 +71,9 @@ from .interval import Gradient, gradient_and_work, Increment, Scales, Time, time
 class SeparableModel(AbstractModel):
     """A `System` for fixed `args`; the `v` of its states are the velocities.
 
-    With `rotates`, its rigid bodies are moved by rotations, and velocities and constraints
-    are those of this kind of coordinates. Otherwise the velocities are those of the user.
+    Rigid bodies in the dimensions `rotates_in` (2 in the plane, 3 in space) are moved by
+    rotations, and velocities and constraints are those of this kind of coordinates.
+    Otherwise the velocities are those of the user.
     """
 
     system: System
@@ -80,7 +86,7 @@ class SeparableModel(AbstractModel):
     kinematics: AbstractKinematics
     # The index tables of `delassus_matrix`; `None` where there is none.
     constraint_tables: SchurTables | None = eqx.field(static=True)
-    # The model without rotations, if this one has some.
+    # The model with the velocities of the user, if those of this one are others.
     without_rotations: "SeparableModel | None"
 
     def __init__(
@@ -89,14 +95,15 @@ class SeparableModel(AbstractModel):
         state: State,
         args: Args,
         *,
-        rotates: bool = False,
+        rotates_in: tuple[int, ...] = (),
     ):
         self.system = system
         self.args = args
         self.has_linear_potential = has_linear_potential(system, state.q, args)
-        kind = system.kinematics.with_rotations(state.q) if rotates else system.kinematics
-        rotates = kind is not system.kinematics
-        self.without_rotations = SeparableModel(system, state, args) if rotates else None
+        kind = system.kinematics.with_rotations(state.q, rotates_in)
+        self.without_rotations = (
+            SeparableModel(system, state, args) if kind.has_own_velocities else None
+        )
         self.kinematics = kind.with_blocks(state.q, self.coordinate, args)
         self.inertia = kind.inertia(
             lambda: system.inertia(state, args),
@@ -177,9 +184,14 @@ class SeparableModel(AbstractModel):
     def force(self, q: Coordinates, v: Velocities, t: Time) -> Velocities:
         return self.user_force(q, self.kinematics.user_velocity(q, v), t)
 
+    def _pull_back_at(self, q: Coordinates, gradient: Coordinates) -> Increments:
+        """The rows of a gradient for a step of zero length."""
+        at_rest = jnp.zeros_like(self.scales.step)
+        return self.kinematics.pull_back(q, q, at_rest, gradient)
+
     def slope(self, state: State) -> Increments:
         q = state.q
-        slope = self.kinematics.pull_back(q, q, jax.grad(self._potential)(q))
+        slope = self._pull_back_at(q, jax.grad(self._potential)(q))
         if self.system.force is None:
             return slope
         return slope - self.pull(q, q, self.force(q, state.v, state.t))
@@ -212,9 +224,10 @@ class SeparableModel(AbstractModel):
         self,
         unknowns: tuple[Float[Array, " np"], ...],
         velocities: Callable[[Reaction], tuple[Velocities, ...]],
+        derivative: AbstractDerivative,
         step: Increments | None,
     ) -> tuple[Velocities, ...]:
-        return velocities(functools.partial(self._reaction, step))
+        return velocities(functools.partial(self._reaction, derivative, step))
 
     def momentum_rows(self, rates: Velocities) -> Float[Array, " np"]:
         return rates[:0]
@@ -248,31 +261,15 @@ class SeparableModel(AbstractModel):
         *,
         is_step: bool,
     ) -> Gradient:
+        step = h * increment.rate if is_step else None
+        rule = self.chain_rule(derivative, step)
+        if rule is not None:
+            return self._gradient_in_rows(rule, a, b, h, increment)
         fixed, driven, nonholonomic = self.split(increment, a.q)
         mean_rate, torque = self._mean_rates(a, b, h, increment, is_step)
-
-        constraint = lambda q: jnp.concatenate([self.fixed(q), self.coordinate(q)])
-        # Both from one evaluation, which the transpose then passes once.
-        with_rate = lambda q: jax.jvp(constraint, (q,), (mean_rate(q),))
-        num_fixed = fixed.velocity_impulse.size
-        rate = lambda q: with_rate(q)[1][:num_fixed]
-        slip_rate = lambda q: self.nonholonomic(q) @ mean_rate(q)
-        has_slip_rate = self.has_slip_rate(nonholonomic)
-
-        def action(q: Coordinates) -> Scalar:
-            out = h * self._potential(q)
-            if num_fixed > 0:
-                value, rates = with_rate(q)
-                out = out + h * fixed.velocity_impulse @ rates[:num_fixed]
-                out = out + fixed.impulse @ value
-            elif fixed.impulse.size > 0:
-                out = out + fixed.impulse @ constraint(q)
-            if has_slip_rate:
-                out = out + h * nonholonomic.velocity_impulse @ slip_rate(q)
-            return out
-
-        def driven_action(q: Coordinates, t: Time) -> Scalar:
-            return self.driven_action(q, mean_rate(q), t, h, driven)
+        action_of_rates = self._action(h, fixed, nonholonomic)
+        action = lambda q: action_of_rates(q, mean_rate(q))
+        driven_action = lambda q, t: self.driven_action(q, mean_rate(q), t, h, driven)
 
         with_time = None if self.system.driven is None else driven_action
         ends, none = ((a.q, a.t), (b.q, b.t)), jnp.zeros((0,), h.dtype)
@@ -285,16 +282,64 @@ class SeparableModel(AbstractModel):
             impulse = self.nonholonomic_impulse(impulse, a, b, nonholonomic)
             return Gradient(impulse, none, work, torque)
         rows: list[Summands] = [lambda q, fn=fn: h * fn(q) for fn in energies]
-        rows += [lambda q: fixed.impulse * constraint(q)]
-        if num_fixed > 0:
-            rows += [lambda q: h * fixed.velocity_impulse * rate(q)]
-        if has_slip_rate:
-            rows += [lambda q: h * nonholonomic.velocity_impulse * slip_rate(q)]
+        rows += [lambda q: fixed.impulse * self._all_fixed(q)]
+        if fixed.velocity_impulse.size > 0:
+            eta = fixed.velocity_impulse
+            rows += [lambda q: h * eta * jax.jvp(self.fixed, (q,), (mean_rate(q),))[1]]
+        if self.has_slip_rate(nonholonomic):
+            eta = nonholonomic.velocity_impulse
+            rows += [lambda q: h * eta * (self.nonholonomic(q) @ mean_rate(q))]
         impulse, work = gradient_and_work_by_rows(derivative, rows, with_time, *ends)
         if self.has_linear_potential:
             impulse = impulse + h * jax.grad(self._potential)(a.q)
         impulse = self.nonholonomic_impulse(impulse, a, b, nonholonomic)
         return Gradient(impulse, none, work, torque)
+
+    def _all_fixed(self, q: Coordinates) -> Array:
+        """`fixed`, and the constraints between redundant coordinates."""
+        return jnp.concatenate([self.fixed(q), self.coordinate(q)])
+
+    def _action(
+        self, h: Scalar, fixed: Increment, nonholonomic: Increment
+    ) -> Callable[[Coordinates, Coordinates], Scalar]:
+        """`h (V + lambda . Phi + eta . psi)` of coordinates and rates, without the driven
+        constraints."""
+
+        def action(q: Coordinates, rates: Coordinates) -> Scalar:
+            out, num_fixed = h * self._potential(q), fixed.velocity_impulse.size
+            if num_fixed > 0:
+                # Both from one evaluation, which the transpose then passes once.
+                rows, psi = jax.jvp(self._all_fixed, (q,), (rates,))
+                out = out + fixed.impulse @ rows
+                out = out + h * fixed.velocity_impulse @ psi[:num_fixed]
+            elif fixed.impulse.size > 0:
+                out = out + fixed.impulse @ self._all_fixed(q)
+            if self.has_slip_rate(nonholonomic):
+                psi = self.nonholonomic(q) @ rates
+                out = out + h * nonholonomic.velocity_impulse @ psi
+            return out
+
+        return action
+
+    def _gradient_in_rows(
+        self, rule: RotationRule, a: State, b: State, h: Scalar, increment: Increment
+    ) -> Gradient:
+        """The discrete gradient with respect to the rows of coordinates, rates and time
+        together."""
+        fixed, driven, nonholonomic = self.split(increment, a.q)
+        action = self._action(h, fixed, nonholonomic)
+
+        def both(x: tuple[Coordinates, Coordinates, Time]) -> Scalar:
+            q, rates, t = x
+            if self.system.driven is None:
+                return action(q, rates)
+            return action(q, rates) + self.driven_action(q, rates, t, h, driven)
+
+        at = lambda state: (state.q, self.lift(state.q, state.v), state.t)
+        rows, _, work = rule.gradient(both, at(a), at(b))
+        impulse = self.nonholonomic_impulse(a.q[:0], a, b, nonholonomic)
+        work = None if self.system.driven is None else work
+        return Gradient(impulse, jnp.zeros((0,), h.dtype), work, rows)
 
     def structure(
         self, a: State, b: State, h: Scalar, rate: Increments, gradient: Gradient
@@ -307,13 +352,24 @@ class SeparableModel(AbstractModel):
             h * rate,
             self.args,
         )
-        balance = balance + self.kinematics.pull_back(a.q, b.q, gradient.impulse)
+        if gradient.impulse.size > 0:
+            pulled = self.kinematics.pull_back(a.q, b.q, h * rate, gradient.impulse)
+            balance = balance + pulled
         if gradient.rows is not None:
             balance = balance + gradient.rows
         return balance, gradient.rate
 
     def reaction_row(self, state: State, eta: JointMultipliers) -> Float[Array, " np"]:
         return jnp.zeros((0,), state.q.dtype)
+
+    def chain_rule(
+        self, derivative: AbstractDerivative, step: Increments | None
+    ) -> RotationRule | None:
+        """The chain rule with respect to the rows, where a kind of coordinates has one and
+        the discrete gradients are those of a step by the chain rule; else `None`."""
+        if step is None or not isinstance(derivative, ChainRule):
+            return None
+        return self.kinematics.chain_rule(step)
 
     def _mean_rates(
         self, a: State, b: State, h: Scalar, increment: Increment, is_step: bool
@@ -329,11 +385,20 @@ class SeparableModel(AbstractModel):
         return rates, None if rows is None else h * rows
 
     def _reaction(
-        self, step: Increments | None, a: Position, b: Position, eta: JointMultipliers
+        self,
+        derivative: AbstractDerivative,
+        step: Increments | None,
+        a: Position,
+        b: Position,
+        eta: JointMultipliers,
     ) -> Velocities:
         """The reaction over an interval, which is that of `step` if this is not `None`."""
         if eta.size == 0:
             return jnp.zeros((self.inertia.shape[0],), eta.dtype)
+        rule = self.chain_rule(derivative, step)
+        if rule is not None:
+            energy = lambda x: eta @ self.joint_rate(*x)
+            return self.inverse_inertia @ rule.gradient_by_rates(energy, a, b)
         ends = self._by_rates(a, eta), self._by_rates(b, eta)
         if step is None:
             momentum = mean_momentum(*ends, self._lowered)
@@ -479,7 +544,7 @@ class SeparableModel(AbstractModel):
             # arrays that are constants of the traced function.
             pulled = self._momentum_rows(q, self.inertia @ acceleration)
             joints = self.constraint_force(q, t, multipliers)
-            pulled = pulled + self.kinematics.pull_back(q, q, joints)
+            pulled = pulled + self._pull_back_at(q, joints)
             rate = self.joint_change(q, acceleration, t) + free_rate
             rows = (
                 (pulled + slope) / scales.step,

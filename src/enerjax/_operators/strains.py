@@ -12,6 +12,7 @@ on the positions alone, and the velocities follow from it in closed form.
 """
 
 from collections.abc import Callable
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -19,11 +20,15 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .._discrete import discrete_grad, discrete_jvp
+from .._discrete import ChainRule, discrete_grad, discrete_jvp
 from .._system import AbstractStrainEnergy, State
 from .._types import Coordinates, Increments, Scalar, Velocities
 from .base import row_scales
 from .separable import SeparableModel
+
+
+# Coordinates and their rates.
+Motion: TypeAlias = tuple[Coordinates, Coordinates]
 
 
 class Strains(eqx.Module):
@@ -73,8 +78,12 @@ class Strains(eqx.Module):
     ) -> Velocities:
         """The discrete gradient of `y . dGamma/dt` with respect to the velocities."""
         none = jnp.zeros_like(qa)
-        energy = self._energy(None, y)
-        _, by_rates = discrete_grad(energy)((qa, none), (qb, none))
+        energy, ends = self._energy(None, y), ((qa, none), (qb, none))
+        rule = self.model.chain_rule(ChainRule(), step)
+        if rule is not None:
+            of_both = lambda x: energy(x[:2])
+            return rule.gradient_by_rates(of_both, (qa, None), (qb, None))
+        _, by_rates = discrete_grad(energy)(*ends)
         # The momenta of gradients with respect to rates are these themselves, except for
         # rotations, which do not use this function.
         return self.model.kinematics.momentum_of_rates(
@@ -82,12 +91,21 @@ class Strains(eqx.Module):
         )
 
     def gradient(
-        self, a: State, b: State, x: Float[Array, " ns"], y: Float[Array, " ns"]
+        self,
+        a: State,
+        b: State,
+        step: Increments,
+        x: Float[Array, " ns"],
+        y: Float[Array, " ns"],
     ) -> tuple[Coordinates, Increments | None]:
         """The discrete gradient of `x . Gamma + y . dGamma/dt` in the coordinates, and
         further rows of the balance of momentum."""
         at = lambda state: (state.q, self.model.lift(state.q, state.v))
-        gradient, by_rates = discrete_grad(self._energy(x, y))(at(a), at(b))
+        energy, rule = self._energy(x, y), self.model.chain_rule(ChainRule(), step)
+        if rule is not None:
+            of_both = lambda x: energy(x[:2])
+            return a.q[:0], rule.gradient(of_both, (*at(a), None), (*at(b), None))[0]
+        gradient, by_rates = discrete_grad(energy)(at(a), at(b))
         _, rows = self.model.kinematics.mean_rates(
             a, b, self.model.lift, lambda: ((a.q, by_rates), (b.q, by_rates))
         )
@@ -103,10 +121,10 @@ class Strains(eqx.Module):
 
     def _energy(
         self, x: Float[Array, " ns"] | None, y: Float[Array, " ns"]
-    ) -> Callable[[tuple[Coordinates, Coordinates]], Scalar]:
+    ) -> Callable[[Motion], Scalar]:
         """`x . Gamma + y . dGamma/dt` of coordinates and their rates."""
 
-        def energy(motion: tuple[Coordinates, Coordinates]) -> Scalar:
+        def energy(motion: Motion) -> Scalar:
             q, rates = motion
             values, changes = jax.jvp(self.values, (q,), (rates,))
             along = jnp.sum(y * changes)

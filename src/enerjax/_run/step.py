@@ -69,8 +69,10 @@ def model_for(
     scheme: AbstractScheme, system: AbstractSystem, state: State, args: Args
 ) -> AbstractModel:
     """The model of a system for a scheme, which may move rigid bodies by rotations."""
-    rotates = isinstance(scheme.stage, AbstractSchemeWithRotations)
-    return make_model(system, state, args, rotates=rotates)
+    stage = scheme.stage
+    has_rotations = isinstance(stage, AbstractSchemeWithRotations)
+    rotates_in = stage.rotates_in if has_rotations else ()
+    return make_model(system, state, args, rotates_in=rotates_in)
 
 
 def first_warm(

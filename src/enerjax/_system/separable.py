@@ -30,6 +30,7 @@ from .kinematics import (
     ConfigurationKinematics,
     DirectorKinematics,
     IdentityKinematics,
+    PlanarKinematics,
 )
 from .names import Names
 
@@ -81,7 +82,12 @@ class System(AbstractSystem):
       rotations, with six unknowns each; the first and the third conserve angular momentum
       to round-off where rotations change neither the potential nor the constraints. Other
       schemes impose six constraints on each body, whose multipliers follow those of
-      `constraint`; they refuse flat bodies, for which `E` is singular.
+      `constraint`; they refuse flat bodies, for which `E` is singular. In the plane the
+      shape is `(bodies, 3)`: the mass centre, then the angle from the axes of space to
+      those of the body, and the kinetic energy is `m |xdot|^2/2 + J angle_rate^2/2`.
+      `EnergyPreserving`, `EnergyMomentumDecaying` and their compositions move such bodies
+      by rotations and conserve angular momentum to round-off, if functions depend on angles
+      by their sines and cosines and by differences of two angles.
     - `names`: names of coordinates, velocities and constraints for tables; see `Names`.
     - `events`: events that belong to the system, such as its impacts, in a list. `simulate`
       looks for them in every run.
@@ -156,7 +162,10 @@ class System(AbstractSystem):
         self.names = names
         self.events = tuple(events)
         if rigid_bodies is not None:
-            self.kinematics = DirectorKinematics(body_table(rigid_bodies))
+            table = body_table(rigid_bodies)
+            in_plane = table.array.shape[1] == 3
+            kind = PlanarKinematics if in_plane else DirectorKinematics
+            self.kinematics = kind(table)
         elif kinematics is not None:
             self.kinematics = ConfigurationKinematics(kinematics)
         else:

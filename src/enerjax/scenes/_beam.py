@@ -84,10 +84,9 @@ class Beam(eqx.Module):
     and its strains without stress, `reference`, shape `(elements, 3)`, in space `(elements,
     6)`.
 
-    In space, `EnergyPreserving` keeps energy, momentum and angular momentum to round-off,
-    and `EnergyMomentumDecaying` keeps the momenta while it damps the strains. In the plane
-    they keep angular momentum to second order. Schemes that refuse flat bodies
-    need a section with three moments of inertia.
+    `EnergyPreserving` keeps energy, momentum and angular momentum to round-off, and
+    `EnergyMomentumDecaying` keeps the momenta while it damps the strains. In space, schemes
+    that refuse flat bodies need a section with three moments of inertia.
 
     **Raises:** `ValueError` for sections that coincide, elements that would turn by more
     than a right angle, a curve that stands still, and impossible numbers.

@@ -128,8 +128,10 @@ def inerters_at(
 
 def internal(layout: Layout, q: Coordinates) -> Multipliers:
     """The constraints between directors, which `System` adds after those of the scene."""
-    table = layout.rigid_bodies
-    return q[:0] if table is None else RigidBodies(table, q.size).constraint(q)
+    if layout.num_internal == 0:
+        return q[:0]
+    assert layout.rigid_bodies is not None
+    return RigidBodies(layout.rigid_bodies, q.size).constraint(q)
 
 
 def driven(layout: Layout, q: Coordinates, t: Scalar, args: Parameters) -> Multipliers:

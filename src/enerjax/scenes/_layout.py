@@ -191,8 +191,10 @@ class Layout:
 
     @property
     def rigid_bodies(self) -> np.ndarray | None:
-        """The coordinates of the bodies with directors; `None` if there are none."""
-        groups = [group.q for group in self.body_groups if group.kind.num_internal]
+        """The coordinates of the bodies with directors, in the plane of those with an
+        angle; `None` if there are none."""
+        rigid = lambda kind: kind.turns and kind.num_redundant == 0
+        groups = [group.q for group in self.body_groups if rigid(group.kind)]
         return np.concatenate(groups) if groups else None
 
     @property

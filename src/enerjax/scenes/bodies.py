@@ -68,7 +68,8 @@ class PlanarBody(AbstractBody):
     - `angle`, `angular_velocity`: from the axes of space to those of the body,
       counterclockwise, and its rate.
 
-    Its coordinates are the mass centre and the angle, which counts full turns.
+    Its coordinates are the mass centre and the angle, which counts full turns. Each is
+    a body in `rigid_bodies` of `System`.
     """
 
     def __init__(

@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any, Generic, Literal, TypeAlias, TypeVar
+from typing import Any, ClassVar, Generic, Literal, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -156,7 +156,7 @@ class StepProblem(eqx.Module):
         """
         momenta = tuple(z.momentum for z, _ in ends)
         step = self.h * ends[-1][0].rate if self.is_one_interval else None
-        found = self.model.node_momenta(momenta, velocities, step)
+        found = self.model.node_momenta(momenta, velocities, self.derivative, step)
         return tuple(
             State(self.position(z), v, t) for (z, t), v in zip(ends, found, strict=True)
         )
@@ -429,10 +429,16 @@ class AbstractSchemeWithChord(AbstractOneSolveScheme[Z, P], Generic[Z, P]):
 
 
 class AbstractSchemeWithRotations(AbstractSchemeWithChord[Z, P], Generic[Z, P]):
-    """A scheme that moves rigid bodies in space by rotations.
+    """A scheme that moves rigid bodies by rotations.
 
     It obtains positions from `StepProblem.position` and displacements from
-    `StepProblem.displacement`; the velocities of a body are `(xdot, W)`, with the angular
-    velocity `W` in body axes. For other schemes the directors of rigid bodies are
-    coordinates with constraints.
+    `StepProblem.displacement`; the velocities of a body in space are `(xdot, W)`, with the
+    angular velocity `W` in body axes. For other schemes the directors of rigid bodies are
+    coordinates with constraints, and steps of bodies in the plane are those of their
+    coordinates.
+
+    - `rotates_in`: the dimensions in which bodies are moved by rotations, 2 in the plane
+      and 3 in space.
     """
+
+    rotates_in: ClassVar[tuple[int, ...]] = (2, 3)

@@ -1,3 +1,5 @@
+from typing import ClassVar
+
 import equinox as eqx
 
 from .._discrete import AbstractDerivative, ChainRule
@@ -61,6 +63,9 @@ class EnergyDecaying(AbstractSchemeWithRotations[JumpAndEnd, StepProblem]):
     **Reference:** E. Lens and A. Cardona, sections 5.1 (alpha = 1, eq. 28) and 5.2
     (eq. 47).
     """
+
+    # A jump does not rotate bodies as a step does, so in the plane it would gain nothing.
+    rotates_in: ClassVar[tuple[int, ...]] = (3,)
 
     alpha: Scalar = eqx.field(converter=as_alpha)
     formulation: Formulation = eqx.field(  # pyright: ignore[reportIncompatibleMethodOverride]

@@ -71,8 +71,7 @@ class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
     - Conserves: linear and angular momentum, to round-off, for any step length, where
       forces, constraints and the rest of the potential permit it; energy at `alpha = 0`.
       Strains must be functions of distances and of dot products, also of directors; with
-      cross products, such as areas, it is conserved to second order. The angular
-      momentum of bodies with an angle, in the plane, is conserved to second order.
+      cross products in space, such as areas, it is conserved to second order.
     - Dissipates: `alpha/2 (g . K g + s . G s)`, which is never negative where `K` is
       positive semidefinite. On a linear oscillator `rho_inf = (1 - alpha) / (1 + alpha)`.
       Only strains are damped: not the rest of the potential, such as gravity, `Potential`s
@@ -80,7 +79,8 @@ class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
     - Constraints held at: position and velocity level.
     - Order: 2. Symmetric at `alpha = 0`, where it conserves what `EnergyPreserving` does,
       by other equations: `Composed` raises its order. Forces enter as in that scheme.
-    - Rigid bodies in space (`rigid_bodies` of a `System`) are moved by rotations.
+    - Rigid bodies (`rigid_bodies` of a `System`) are moved by rotations, as in
+      `EnergyPreserving`.
     - Requires a potential with strains: that of a scene with springs or beams, or
       `Elements.from_strains`; constant inertia, and no `kinematics`.
 
@@ -166,7 +166,9 @@ class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
         gradient = step.discrete_gradient(start, end, z.end)
         gradient = gradient.less(step.step_load(end, z.end))
         stresses = strains.stresses(jumps.strain)
-        terms = strains.gradient(start, end, h / 2 * stresses, h / 2 * jumps.impulse)
+        terms = strains.gradient(
+            start, end, h * z.end.rate, h / 2 * stresses, h / 2 * jumps.impulse
+        )
         change = strains.change(start.q, end.q, step.displacement(z.end))
         moved = change - self._alpha(h) * jumps.strain
         of_strains = jumps.impulse - h / 6 * strains.stresses(moved)

@@ -23,8 +23,10 @@ class EnergyPreserving(AbstractSchemeWithRotations[Increment, StepProblem]):
       Nonholonomic constraints hold for the displacement, `A(qm) (q1 - q0) = 0`, instead of
       the position.
     - Order: 2. Symmetric: `Composed` raises the order to 4, 6 or 8.
-    - Rigid bodies in space (`rigid_bodies` of a `System`) are moved by rotations; linear
-      and angular momentum are conserved to round-off where forces permit it.
+    - Rigid bodies (`rigid_bodies` of a `System`) are moved by rotations; linear and angular
+      momentum are conserved to round-off where forces permit it, of bodies in the plane
+      with `ChainRule`. A body that turns freely is late by the part `(h omega)^2/12` of its
+      angle, and turns by less than half a turn in a step.
 
     **Arguments:**
 

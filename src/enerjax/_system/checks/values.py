@@ -115,7 +115,7 @@ def check_without_rotations(
     """Raises an error for a flat body in a scheme that moves no bodies by rotations."""
     if not isinstance(system, System):
         return
-    if system.kinematics.with_rotations(state.q) is system.kinematics:
+    if system.kinematics.with_rotations(state.q, (3,)) is system.kinematics:
         return
     is_regular = _facts(system, state, args)["regular"]
     if is_known(is_regular) and not is_regular:
@@ -217,7 +217,8 @@ def _messages_of_inertia(system: AbstractSystem, kinetic: str | None) -> dict[st
             f"The {inertia} is not that of rigid bodies: with the same velocities in body "
             "axes the kinetic energy changes from one rotation to another. That of each "
             "body in `rigid_bodies` must be `m |xdot|^2/2 + "
-            "sum_ij E_ij d_i_dot . d_j_dot/2` with its mass centre `x` and axes `d_i`. Is "
+            "sum_ij E_ij d_i_dot . d_j_dot/2` with its mass centre `x` and axes `d_i`, in "
+            "the plane `m |xdot|^2/2 + J angle_rate^2/2`. Is "
             "`x` another point of the body, or does a term couple bodies? Take the mass "
             "centre; a point with the components `p_i` in body axes is `x + "
             "sum_i p_i d_i`. Or leave out `rigid_bodies` and write the "

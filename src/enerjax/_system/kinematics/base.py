@@ -26,6 +26,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
+from ..._discrete import RotationRule
 from ..._solvers import IndependentBlocks, solve_by_blocks, Symmetric
 from ..._types import (
     Args,
@@ -80,6 +81,20 @@ class AbstractKinematics(eqx.Module):
     def has_canonical_rates(self) -> bool:
         """Whether `L = I`, and steps are added to the coordinates."""
 
+    @property
+    @abc.abstractmethod
+    def has_own_velocities(self) -> bool:
+        """Whether a step uses velocities other than those of the user."""
+
+    @abc.abstractmethod
+    def chain_rule(self, step: Increments) -> RotationRule | None:
+        """The chain rule over a step, with respect to the rows instead of the coordinates.
+
+        It is for coordinates that are not linear in the steps. Then the discrete gradients
+        of functions of coordinates and rates are taken in both together. `None` where the
+        chain rule in the coordinates conserves momenta.
+        """
+
     @abc.abstractmethod
     def has_inertia(self, energy: KineticEnergy, inertia: Symmetric) -> Flag:
         """Whether coordinates of this kind can have this kinetic energy, and the inertia
@@ -101,10 +116,13 @@ class AbstractKinematics(eqx.Module):
         """How the coordinates move, in words."""
 
     @abc.abstractmethod
-    def with_rotations(self, q: Coordinates) -> "AbstractKinematics":
+    def with_rotations(
+        self, q: Coordinates, dimensions: tuple[int, ...]
+    ) -> "AbstractKinematics":
         """The kind that moves bodies with these coordinates by rotations.
 
-        It is the same kind if there are no such bodies.
+        It is the same kind if there are no such bodies in these dimensions: 2 in the plane,
+        3 in space.
         """
 
     @abc.abstractmethod
@@ -171,7 +189,11 @@ class AbstractKinematics(eqx.Module):
 
     @abc.abstractmethod
     def pull_back(
-        self, qa: Coordinates, qb: Coordinates, gradient: Coordinates
+        self,
+        qa: Coordinates,
+        qb: Coordinates,
+        step: Increments,
+        gradient: Coordinates,
     ) -> Increments:
         """`P^T gradient`, the rows of a gradient with respect to the coordinates."""
 
@@ -260,7 +282,11 @@ def mean_momentum(a: ByRates, b: ByRates, lowered: Lowered) -> Velocities:
 
 
 class AbstractFlatKinematics(AbstractKinematics):
-    """A kind of coordinates to which steps are added; its velocities are the user's."""
+    """A kind of coordinates whose velocities are the user's."""
+
+    @property
+    def has_own_velocities(self):
+        return False
 
     def velocity(self, q, v):
         return v
@@ -274,15 +300,22 @@ class AbstractFlatKinematics(AbstractKinematics):
     def coordinate_scale(self, step):
         return step
 
-    def displacement(self, q, step):
-        return step
-
-    def pull_back(self, qa, qb, gradient):
-        return gradient
-
     def mean_rates(self, a, b, lift, by_rates):
         mean = 0.5 * (a.v + b.v)
         return lambda q: lift(q, mean), None
 
     def momentum_of_rates(self, a, b, step, lowered):
         return mean_momentum(a, b, lowered)
+
+
+class AbstractAddedKinematics(AbstractFlatKinematics):
+    """A kind of coordinates to which steps are added."""
+
+    def displacement(self, q, step):
+        return step
+
+    def pull_back(self, qa, qb, step, gradient):
+        return gradient
+
+    def chain_rule(self, step):
+        return None

@@ -18,10 +18,10 @@ from ..._solvers import (
     multiply_by_blocks,
 )
 from ..._types import Args, Coordinates, Increments, Velocities
-from .base import AbstractFlatKinematics, Frames
+from .base import AbstractAddedKinematics, Frames
 
 
-class ConfigurationKinematics(AbstractFlatKinematics):
+class ConfigurationKinematics(AbstractAddedKinematics):
     """`v = L(q) qdot` with a user's function `L(q, args)`: bodies that rotate."""
 
     matrix: Callable[[Coordinates, Args], Float[Array, "nv nq"]]
@@ -44,7 +44,7 @@ class ConfigurationKinematics(AbstractFlatKinematics):
     def describe(self, q, v):
         return f"{q.size} coordinates with {v.size} velocities v = L(q) qdot"
 
-    def with_rotations(self, q):
+    def with_rotations(self, q, dimensions):
         return self
 
     def with_blocks(self, q, relations, args):

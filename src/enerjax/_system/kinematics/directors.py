@@ -11,12 +11,13 @@ from jaxtyping import Array, Float
 from ..._programs import Indices
 from ..._solvers import hessian, is_positive_definite, Symmetric
 from ..._types import Flag, Scalar, Velocities
+from .base import AbstractAddedKinematics
 from .plain import AbstractPlainKinematics
 from .rigid_bodies import RigidBodies
 from .rotations import RigidKinematics
 
 
-class DirectorKinematics(AbstractPlainKinematics):
+class DirectorKinematics(AbstractPlainKinematics, AbstractAddedKinematics):
     """`v = qdot`, with six constraints between the directors of each body.
 
     - `table`: the indices of the coordinates of each body, shape `(bodies, 12)`; see
@@ -41,8 +42,8 @@ class DirectorKinematics(AbstractPlainKinematics):
         second, size = self._second_moments(inertia)
         return _is_positive_definite(second - rounding * size)
 
-    def with_rotations(self, q):
-        return self._rotations(q.size)
+    def with_rotations(self, q, dimensions):
+        return self._rotations(q.size) if 3 in dimensions else self
 
     def constraint(self, q):
         return _bodies(self.table, q.size).constraint(q)

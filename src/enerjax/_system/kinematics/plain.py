@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from ..._solvers import is_positive_definite
-from .base import AbstractFlatKinematics
+from .base import AbstractAddedKinematics, AbstractFlatKinematics
 
 
 class AbstractPlainKinematics(AbstractFlatKinematics):
@@ -50,20 +50,14 @@ class AbstractPlainKinematics(AbstractFlatKinematics):
         return None
 
 
-class IdentityKinematics(AbstractPlainKinematics):
-    """Point masses, minimal coordinates with constant inertia."""
-
-    def has_inertia(self, energy, inertia):
-        return jnp.array(True)
+class AbstractIndependentKinematics(AbstractPlainKinematics):
+    """`v = qdot`, without constraints between the coordinates."""
 
     def is_definite(self, inertia, rounding):
         return is_positive_definite(inertia)
 
     def is_regular(self, inertia, rounding):
         return jnp.array(True)
-
-    def with_rotations(self, q):
-        return self
 
     def constraint(self, q):
         return q[:0]
@@ -73,3 +67,13 @@ class IdentityKinematics(AbstractPlainKinematics):
 
     def velocity_scale(self, inertia):
         return jnp.sqrt(inertia.diagonal())
+
+
+class IdentityKinematics(AbstractIndependentKinematics, AbstractAddedKinematics):
+    """Point masses, minimal coordinates with constant inertia."""
+
+    def has_inertia(self, energy, inertia):
+        return jnp.array(True)
+
+    def with_rotations(self, q, dimensions):
+        return self

@@ -17,13 +17,15 @@ Pose: TypeAlias = tuple[Vector3, Axes]
 
 
 def body_table(rigid_bodies: Any) -> Indices:
-    """The checked indices of the coordinates of rigid bodies, shape `(bodies, 12)`."""
+    """The checked indices of the coordinates of rigid bodies, shape `(bodies, 12)`, in the
+    plane `(bodies, 3)`."""
     table = np.asarray(rigid_bodies)
-    if table.ndim != 2 or table.shape[1] != 12 or table.dtype.kind not in "iu":
+    if table.ndim != 2 or table.shape[1] not in (3, 12) or table.dtype.kind not in "iu":
         raise ValueError(
             "`System(rigid_bodies=...)` must hold the indices of the twelve coordinates of "
             "each body (its mass centre, then its three axes), integers of shape "
-            f"(bodies, 12); got shape {table.shape} of {table.dtype}."
+            f"(bodies, 12); got shape {table.shape} of {table.dtype}. In the plane a body "
+            "has three (its mass centre, then its angle), shape (bodies, 3)."
         )
     if table.min(initial=0) < 0 or np.unique(table).size != table.size:
         raise ValueError(
@@ -31,6 +33,17 @@ def body_table(rigid_bodies: Any) -> Indices:
             "to two bodies or twice to one."
         )
     return Indices(table)
+
+
+def check_indices(table: np.ndarray, size: int) -> None:
+    """Raises a `ValueError` if a body has coordinates that do not exist."""
+    if table.max(initial=-1) >= size:
+        of = "the three axes" if table.shape[1] == 12 else "the angle"
+        raise ValueError(
+            f"`System(rigid_bodies=...)` holds the index {table.max()}, but `q` has {size} "
+            f"entries, with the indices 0 to {size - 1}. Each row holds the indices of the "
+            f"mass centre and of {of} of a body."
+        )
 
 
 class RigidBodies(Indices):
@@ -47,12 +60,7 @@ class RigidBodies(Indices):
     def __init__(self, table: Sequence[Sequence[int]] | np.ndarray, size: int):
         super().__init__(np.append(np.ravel(table), size))
         self.q = np.asarray(table).reshape(-1, 12)
-        if self.q.max(initial=-1) >= size:
-            raise ValueError(
-                f"`System(rigid_bodies=...)` holds the index {self.q.max()}, but `q` has "
-                f"{size} entries, with the indices 0 to {size - 1}. Each row holds the "
-                "indices of the mass centre and of the three axes of a body."
-            )
+        check_indices(self.q, size)
         self.other_q = np.setdiff1d(np.arange(size), self.q)
         firsts = np.concatenate([self.q[:, 0], self.other_q])
         counts = np.repeat([6, 1], [len(self.q), self.other_q.size])
@@ -65,38 +73,38 @@ class RigidBodies(Indices):
 
     def pose(self, q: Coordinates) -> Pose:
         """The mass centres and directors of all bodies, or their rates or gradients."""
-        rows = _entries(q, self.q).reshape(-1, 12).T
+        rows = entries(q, self.q).reshape(-1, 12).T
         return rows[:3], rows[3:].reshape(3, 3, -1)
 
     def vectors(self, v: Velocities) -> tuple[Vector3, Vector3]:
         """The translational and the rotational parts of the velocities."""
-        rows = _entries(v, self.v).reshape(-1, 6).T
+        rows = entries(v, self.v).reshape(-1, 6).T
         return rows[:3], rows[3:]
 
     def coordinates(self, pose: Pose, others: Float[Array, " n"]) -> Coordinates:
         """The inverse of `pose`, with the values of the other coordinates."""
         centres, axes = pose
         rows = jnp.concatenate([centres, axes.reshape(9, -1)])
-        return _joined(rows.T.ravel(), self.q, others, self.other_q)
+        return joined(rows.T.ravel(), self.q, others, self.other_q)
 
     def velocities(
         self, moved: Vector3, turned: Vector3, others: Float[Array, " n"]
     ) -> Velocities:
         """The inverse of `vectors`, with the values of the other velocities."""
         rows = jnp.concatenate([moved, turned])
-        return _joined(rows.T.ravel(), self.v, others, self.other_v)
+        return joined(rows.T.ravel(), self.v, others, self.other_v)
 
     def others(self, q: Coordinates) -> Float[Array, " n"]:
         """The coordinates that belong to no rigid body."""
-        return _entries(q, self.other_q)
+        return entries(q, self.other_q)
 
     def other_rates(self, v: Velocities) -> Float[Array, " n"]:
         """The velocities that belong to no rigid body."""
-        return _entries(v, self.other_v)
+        return entries(v, self.other_v)
 
     def constraint(self, q: Coordinates) -> Float[Array, " 6*bodies"]:
         """The products of the directors less those of orthonormal ones, body by body."""
-        axes = _entries(q, self.q).reshape(-1, 4, 3)[:, 1:]
+        axes = entries(q, self.q).reshape(-1, 4, 3)[:, 1:]
         products = jnp.sum(axes[:, _LEFT] * axes[:, _RIGHT], axis=2)
         return (products - jnp.asarray(_LEFT == _RIGHT, q.dtype)[None]).ravel()
 
@@ -113,7 +121,7 @@ class RigidBodies(Indices):
 _LEFT, _RIGHT = np.array([0, 1, 2, 1, 2, 0]), np.array([0, 1, 2, 2, 0, 1])
 
 
-def _entries(x: Array, index: np.ndarray) -> Array:
+def entries(x: Array, index: np.ndarray) -> Array:
     """`x[index]`, which is a slice if the indices are consecutive."""
     flat = index.ravel()
     if flat.size == 0:
@@ -123,7 +131,7 @@ def _entries(x: Array, index: np.ndarray) -> Array:
     return x[flat]
 
 
-def _joined(x: Array, at: np.ndarray, y: Array, others: np.ndarray) -> Array:
+def joined(x: Array, at: np.ndarray, y: Array, others: np.ndarray) -> Array:
     """The entries of `x` at the indices `at`, and those of `y` at `others`."""
     places = np.concatenate([at.ravel(), others])
     both = x if others.size == 0 else jnp.concatenate([x, y])

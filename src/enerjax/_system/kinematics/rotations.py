@@ -49,6 +49,10 @@ class RigidKinematics(AbstractKinematics):
     def has_canonical_rates(self):
         return False
 
+    @property
+    def has_own_velocities(self):
+        return True
+
     def has_inertia(self, energy, inertia):
         # The energy must depend on velocities in body axes alone, as it does for a body
         # with its mass centre at `x`. It is compared with that of randomly rotated bodies.
@@ -79,7 +83,7 @@ class RigidKinematics(AbstractKinematics):
             + (f", and {others} others" if others > 0 else "")
         )
 
-    def with_rotations(self, q):
+    def with_rotations(self, q, dimensions):
         return self
 
     def with_blocks(self, q, relations, args):
@@ -141,17 +145,21 @@ class RigidKinematics(AbstractKinematics):
         change = factor[None, None] * (once + twice)
         return bodies.coordinates((moved, change), bodies.other_rates(step))
 
-    def pull_back(self, qa, qb, gradient):
-        bodies, (force, torques) = self.bodies, self.bodies.pose(gradient)
-        (_, first), (_, last) = bodies.pose(qa), bodies.pose(qb)
-        torque = in_axes(first, sum_of_products(0.5 * (first + last), torques))
-        return bodies.velocities(force, torque, bodies.others(gradient))
+    def pull_back(self, qa, qb, step, gradient):
+        return self.pull(qa, qb, gradient, None)
+
+    def chain_rule(self, step):
+        return None
 
     def push(self, qa, qb, step, args):
         return step
 
     def pull(self, qa, qb, force, args):
-        return self.pull_back(qa, qb, force)
+        bodies, others = self.bodies, self.bodies.others(force)
+        moved, torques = bodies.pose(force)
+        (_, first), (_, last) = bodies.pose(qa), bodies.pose(qb)
+        torque = in_axes(first, sum_of_products(0.5 * (first + last), torques))
+        return bodies.velocities(moved, torque, others)
 
     def rates(self, q, v, jacobian, args):
         return v
