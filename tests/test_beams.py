@@ -299,6 +299,35 @@ def test_a_free_beam_in_space_keeps_energy_and_momenta(free, scheme):
 
 
 @pytest.mark.slow
+def test_energy_and_momenta_of_a_free_beam_change_by_a_random_walk(free):
+    """In 1e5 steps they change by round-off that grows like the square root of the steps.
+
+    The mass centre is at rest: far from the origin the coordinates lose digits.
+    """
+    scene, start = free
+    parts = jnp.array([3 / 8, 7 / 6, 11 / 12, 7 / 6, 3 / 8]) / 4
+    v = start.v.reshape(5, 4, 3)
+    v = v.at[:, 0].add(-parts @ v[:, 0])
+    steps, every = 100_000, 100
+    sol = ej.simulate(
+        scene.system, ej.EnergyPreserving(), ej.State(start.q, v.ravel()), scene.args,
+        h=0.02, num_steps=steps, saveat=ej.SaveAt(every=every),
+    )  # fmt: skip
+    momentum, angular = _momenta(scene, sol)
+    typical = jnp.sum(parts * jnp.linalg.norm(v[:, 0], axis=1)) * 5.0
+    energy = sol.audit.energy[:, None]
+    sizes = (energy[0, 0], typical, jnp.linalg.norm(angular[0]))
+    for found, size in zip((energy, momentum, angular), sizes, strict=True):
+        of_steps = lambda n, x=found: float(
+            jnp.sqrt(jnp.mean(jnp.sum((x[n // every :] - x[: -n // every]) ** 2, axis=1)))
+        )
+        # A walk of 64 times as many steps goes 8 times as far, and a drift 64 times.
+        assert of_steps(64 * every) < 16 * of_steps(every)
+        change = float(jnp.abs(found - found[:1]).max())
+        assert change < 50 * EPS * np.sqrt(steps) * float(size)  # round-off
+
+
+@pytest.mark.slow
 def test_a_free_beam_keeps_its_momenta_while_it_is_damped(free):
     scene, start = free
     scheme = ej.EnergyMomentumDecaying(0.5)
