@@ -377,7 +377,7 @@ def test_the_order_on_a_four_bar_of_beams(scheme, order, bound):
             ej.joints.Revolute("A", "ground", crank.start),
             ej.joints.Revolute("B", crank.end, coupler.start),
             ej.joints.Revolute("C", coupler.end, rocker.start),
-            ej.joints.Revolute("D", "ground", rocker.end),
+            ej.joints.Revolute("D", "ground", rocker.end, pins[3]),
         ],
         gravity=[0.0, -9.81],
     )
