@@ -97,8 +97,8 @@ def accuracy_rows() -> list[harness.Row]:
 
     @jax.jit
     def places(h):
-        run = dict(h=h, num_steps=CONVERGED, throw=False)
-        sol = ej.simulate(system, ej.EnergyPreserving(), start, args, **run)
+        scheme, steps = ej.EnergyPreserving(), CONVERGED
+        sol = ej.simulate(system, scheme, start, args, h=h, num_steps=steps, throw=False)
         return scene.position(sol.ys, "beam:end")
 
     exact = np.asarray(places(DURATION / CONVERGED)[-1])

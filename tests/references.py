@@ -104,8 +104,7 @@ def four_bar_of_beams(t, pins, EA, GA, EI, rhoA, rhoI, g=9.81):
     middles = (pins[:-1] + pins[1:]) / 2
     x = np.concatenate([np.stack([pins[:-1], middles], axis=1).reshape(6, 2), pins[3:]])
     start = np.concatenate([x[1:6].ravel(), np.repeat(angles, 3), np.zeros(19)])
-    tolerances = dict(method="DOP853", rtol=1e-12, atol=1e-12)
-    x, turned = places_and_angles(solve_ivp(rates, (0, t), start, **tolerances).y[:, -1])
+    x, turned = places_and_angles(_integrate(rates, start, t))
     of_beam = lambda k: np.column_stack([x[2 * k : 2 * k + 3], turned[3 * k : 3 * k + 3]])
     return np.concatenate([of_beam(k).ravel() for k in range(3)])
 

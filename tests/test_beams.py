@@ -387,8 +387,9 @@ def test_the_order_on_a_four_bar_of_beams(scheme, order, bound):
     assert np.abs(exact - start.q).max() > 0.5
     for steps in (120, 240):
         # Beyond the time `t` with the longer steps: the runs share a program.
-        run = dict(h=t / steps, num_steps=240, throw=False)
-        sol = ej.simulate(system, scheme, start, args, **run)
+        sol = ej.simulate(
+            system, scheme, start, args, h=t / steps, num_steps=240, throw=False
+        )
         errors.append(float(np.abs(sol.ys.q[steps] - exact).max()))
     assert errors[1] < bound  # truncation
     assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.3)
@@ -414,8 +415,9 @@ def test_a_motion_has_gradients_by_stiffness_load_and_mass():
         EI, load, mass = x
         loaded = args.set("load", force=load * jnp.array([0.0, 1.0]))
         moved = loaded.set("beam", EI=EI).set("weight", mass=mass)
-        run = dict(h=0.02, num_steps=50, throw=False)
-        sol = ej.simulate(system, ej.EnergyPreserving(), start, moved, **run)
+        sol = ej.simulate(
+            system, ej.EnergyPreserving(), start, moved, h=0.02, num_steps=50, throw=False
+        )
         return scene.position(sol.ys, beam.end)[-1, 1]
 
     at = np.array([2.0, -1.0, 0.3])
