@@ -8,8 +8,8 @@
 - `right angle`: J. C. Simo and L. Vu-Quoc (1988); digitised from the paper, to 0.5 %.
 - `double pendulum`: M. Geradin and A. Cardona (2001), nearly rigid; the rigid mechanism by
   an explicit Runge-Kutta method of order 8 in two angles.
-- `order`: a four-bar mechanism of beams, errors against a run with short steps.
-- `long run`: a free beam, the largest changes of energy and momenta in 1e5 steps.
+- `long run`: a free beam, the largest changes of energy and momenta in 1e5 steps, with its
+  mass centre at rest and far from the origin.
 
 Writes beam_problems.csv.
 """
@@ -207,60 +207,38 @@ def _rigid_double_pendulum(t: float) -> np.ndarray:
     return np.array([np.cos(a) + np.cos(b), np.sin(a) + np.sin(b)])
 
 
-def order() -> Iterator[Row]:
-    pins = [[0.0, 0.0], [2.0, 1.0], [3.5, 1.0], [2.5, 0.0]]
-    bar = ej.Section.rectangle(0.05, 0.05, E=2.1e8, nu=0.3, rho=2710.0, shear_factor=1.0)
-    bars = [ej.bodies.Beam(name, [pins[k], pins[k + 1]], bar, 2)
-            for k, name in enumerate(("crank", "coupler", "rocker"))]  # fmt: skip
-    crank, coupler, rocker = bars
-    scene = ej.Scene(
-        [
-            *bars,
-            ej.joints.Revolute("A", "ground", crank.start, pins[0]),
-            ej.joints.Revolute("B", crank.end, coupler.start),
-            ej.joints.Revolute("C", coupler.end, rocker.start),
-            ej.joints.Revolute("D", "ground", rocker.end, pins[3]),
-        ],
-        gravity=[0.0, -9.81],
-    )
-    system, start, args = scene.build()
-    schemes = {
-        "EnergyPreserving()": ej.EnergyPreserving(),
-        "Composed(EnergyPreserving(), 4)": ej.Composed(ej.EnergyPreserving(), 4),
-        "EnergyMomentumDecaying(0.5)": ej.EnergyMomentumDecaying(0.5),
-        "EnergyConsistent(0.0)": ej.EnergyConsistent(0.0),
-    }
-    end = lambda scheme, steps: ej.simulate(
-        system, scheme, start, args, h=0.1 / steps, num_steps=steps
-    ).ys.q[-1]
-    exact = end(schemes["Composed(EnergyPreserving(), 4)"], 1600)
-    for name, scheme in schemes.items():
-        errors = [
-            float(jnp.abs(end(scheme, steps) - exact).max()) for steps in (100, 200, 400)
-        ]
-        for a, b, steps in zip(errors, errors[1:], (200, 400), strict=False):
-            yield Row("order", f"{name}, {steps} steps", "error", b, 0.0)
-            yield Row("order", f"{name}, {steps} steps", "order", np.log2(a / b), None)
-
-
 def long_run() -> Iterator[Row]:
     section = ej.Section(EA=1e4, GA=1e4, EI=[100.0, 50.0], GJ=40.0, rhoA=1.0, rhoI=0.1)
     beam = ej.bodies.Beam(
-        "beam", [[0, 0, 0], [3.0, 0, 4.0]], section, 2, velocity=[1.0, 0, 0],
-        angular_velocity=[0.5, 1.0, 0.2],
-    )  # fmt: skip
+        "beam", [[0, 0, 0], [3.0, 0, 4.0]], section, 2, angular_velocity=[0.5, 1.0, 0.2]
+    )
     scene = ej.Scene([beam])
-    start = scene.start()
-    v = start.v.reshape(-1, 12).at[-1, 0].add(2.0).ravel()
-    start = ej.State(start.q, v)
-    for steps in (1_000, 10_000, 100_000):
-        sol = ej.simulate(
-            scene.system, ej.EnergyPreserving(), start, scene.args, h=0.02,
-            num_steps=steps, saveat=ej.SaveAt(every=steps // 100),
-        )  # fmt: skip
-        energy = np.asarray(sol.audit.energy)
-        change = float(np.abs(energy - energy[0]).max() / energy[0])
-        yield Row("long run", f"{steps} steps", "energy, relative", change, 0.0)
+    system, at_rest, args = scene.system, scene.start(), scene.args
+    momenta = jax.jit(jax.vmap(lambda q, v: _momenta_in_space(system, args, q, v)))
+    v = at_rest.v.reshape(-1, 12).at[-1, 0].add(2.0)
+    # A third of the mass moves with the velocity 2: two thirds is that of the mass centre.
+    for name, velocity in (("at rest", -1 / 3), ("at 4/3", 1.0)):
+        start = ej.State(at_rest.q, v.at[:, 0].add(velocity).ravel())
+        for steps in (1_000, 10_000, 100_000):
+            sol = ej.simulate(
+                system, ej.EnergyPreserving(), start, args, h=0.02, num_steps=steps,
+                saveat=ej.SaveAt(every=steps // 100),
+            )  # fmt: skip
+            setting = f"mass centre {name}, {steps} steps"
+            energy = np.asarray(sol.audit.energy)[:, None]
+            linear, angular = map(np.asarray, momenta(sol.ys.q, sol.ys.v))
+            sizes = energy[0, 0], 5.0, np.linalg.norm(angular[0])
+            names = "energy", "momentum", "angular momentum"
+            for what, x, size in zip(names, (energy, linear, angular), sizes, strict=True):
+                change = float(np.abs(x - x[:1]).max() / size)
+                yield Row("long run", setting, f"change of {what}, relative", change, 0.0)
+
+
+def _momenta_in_space(system, args, q, v) -> tuple[jax.Array, jax.Array]:
+    """Momentum, and angular momentum about the origin."""
+    momentum = jax.grad(lambda v: system.kinetic_energy(ej.State(q, v), args))(v)
+    x, p = q.reshape(-1, 4, 3), momentum.reshape(-1, 4, 3)
+    return jnp.sum(p[:, 0], axis=0), jnp.sum(jnp.cross(x, p), axis=(0, 1))
 
 
 PROBLEMS: dict[str, Callable[[], Iterator[Row]]] = {
@@ -269,7 +247,6 @@ PROBLEMS: dict[str, Callable[[], Iterator[Row]]] = {
     "spaghetti": spaghetti,
     "right angle": right_angle,
     "double pendulum": double_pendulum,
-    "order": order,
     "long run": long_run,
 }
 

@@ -60,6 +60,55 @@ def spring_pendulum_reference(t, k=100.0, g=9.81):
     return SimpleNamespace(q=y[:2], v=y[2:])
 
 
+def four_bar_of_beams(t, pins, EA, GA, EI, rhoA, rhoI, g=9.81):
+    """Three beams of two elements each between four pins, which fall from rest.
+
+    The places of the pins are shared, so the equations have no constraints. Returns the
+    places and angles of the three sections of each beam, shape `(27,)`.
+    """
+    chords = np.diff(pins, axis=0)
+    lengths, angles = np.hypot(*chords.T), np.arctan2(chords[:, 1], chords[:, 0])
+    # Simpson's rule for the masses, halves of the elements for the rotations.
+    masses, inertias = np.zeros(7), np.kron(lengths, [1, 2, 1]) * rhoI / 4
+    for k in range(3):
+        masses[2 * k : 2 * k + 3] += rhoA * lengths[k] * np.array([1, 4, 1]) / 6
+    # The first place and the first angle of each element, and its length.
+    place, angle = np.arange(6), np.array([0, 1, 3, 4, 6, 7])
+    size = np.repeat(lengths, 2) / 2
+
+    def places_and_angles(y):
+        x = np.concatenate([pins[:1], y[:10].reshape(5, 2), pins[3:]])
+        return x, y[10:19]
+
+    def rates(_, y):
+        x, turned = places_and_angles(y)
+        along = (x[place + 1] - x[place]) / size[:, None]
+        middle = (turned[angle] + turned[angle + 1]) / 2
+        c, s = np.cos(middle), np.sin(middle)
+        stretch, shear = (
+            c * along[:, 0] + s * along[:, 1],
+            c * along[:, 1] - s * along[:, 0],
+        )
+        normal, across = EA * (stretch - 1), GA * shear
+        moment = EI * (turned[angle + 1] - turned[angle]) / size
+        pull = np.stack([c * normal - s * across, s * normal + c * across], axis=1)
+        couple = (across * stretch - normal * shear) * size / 2
+        force, torque = np.outer(masses, [0.0, -g]), np.zeros(9)
+        np.add.at(force, place, pull)
+        np.add.at(force, place + 1, -pull)
+        np.add.at(torque, angle, couple + moment)
+        np.add.at(torque, angle + 1, couple - moment)
+        accelerations = (force / masses[:, None])[1:6].ravel(), torque / inertias
+        return np.concatenate([y[19:], *accelerations])
+
+    middles = (pins[:-1] + pins[1:]) / 2
+    x = np.concatenate([np.stack([pins[:-1], middles], axis=1).reshape(6, 2), pins[3:]])
+    start = np.concatenate([x[1:6].ravel(), np.repeat(angles, 3), np.zeros(19)])
+    x, turned = places_and_angles(_integrate(rates, start, t))
+    of_beam = lambda k: np.column_stack([x[2 * k : 2 * k + 3], turned[3 * k : 3 * k + 3]])
+    return np.concatenate([of_beam(k).ravel() for k in range(3)])
+
+
 def point_on_rod(t):
     """Case b from the angle of case a: the same motion, with gravity along +y."""
     angle, rate = pendulum_reference(t)

@@ -11,7 +11,7 @@ import scipy
 import enerjax as ej
 
 from .helpers import EPS
-from .references import cantilever_by_shooting
+from .references import cantilever_by_shooting, four_bar_of_beams
 
 
 SOFT = ej.Section(EA=1e4, GA=1e4, EI=100.0, GJ=100.0, rhoA=1.0, rhoI=10.0)
@@ -306,6 +306,35 @@ def test_a_free_beam_in_space_keeps_energy_and_momenta(free, scheme):
 
 
 @pytest.mark.slow
+def test_energy_and_momenta_of_a_free_beam_change_by_a_random_walk(free):
+    """In 1e5 steps they change by round-off that grows like the square root of the steps.
+
+    The mass centre is at rest: far from the origin the coordinates lose digits.
+    """
+    scene, start = free
+    parts = jnp.array([3 / 8, 7 / 6, 11 / 12, 7 / 6, 3 / 8]) / 4
+    v = start.v.reshape(5, 4, 3)
+    v = v.at[:, 0].add(-parts @ v[:, 0])
+    steps, every = 100_000, 100
+    sol = ej.simulate(
+        scene.system, ej.EnergyPreserving(), ej.State(start.q, v.ravel()), scene.args,
+        h=0.02, num_steps=steps, saveat=ej.SaveAt(every=every),
+    )  # fmt: skip
+    momentum, angular = _momenta(scene, sol)
+    typical = jnp.sum(parts * jnp.linalg.norm(v[:, 0], axis=1)) * 5.0
+    energy = sol.audit.energy[:, None]
+    sizes = (energy[0, 0], typical, jnp.linalg.norm(angular[0]))
+    for found, size in zip((energy, momentum, angular), sizes, strict=True):
+        of_steps = lambda n, x=found: float(
+            jnp.sqrt(jnp.mean(jnp.sum((x[n // every :] - x[: -n // every]) ** 2, axis=1)))
+        )
+        # A walk of 64 times as many steps goes 8 times as far, and a drift 64 times.
+        assert of_steps(64 * every) < 16 * of_steps(every)
+        change = float(jnp.abs(found - found[:1]).max())
+        assert change < 50 * EPS * np.sqrt(steps) * float(size)  # round-off
+
+
+@pytest.mark.slow
 def test_a_free_beam_keeps_its_momenta_while_it_is_damped(free):
     scene, start = free
     scheme = ej.EnergyMomentumDecaying(0.5)
@@ -332,21 +361,80 @@ def test_a_decaying_scheme_damps_a_free_beam(free):
 
 
 @pytest.mark.slow
-def test_the_stiffness_of_a_beam_has_gradients():
-    def tip(EI):
-        beam, scene = _cantilever([[0.0, 0.0], [1.0, 0.0]], SOFT, 4)
-        scene = ej.Scene(
-            [beam, ej.joints.Fixed("clamp", "ground", beam.start)], gravity=[0.0, -5.0]
-        )
-        args = scene.args.set("beam", EI=EI)
+@pytest.mark.parametrize(
+    ("scheme", "order", "bound"),
+    [
+        (ej.EnergyPreserving(), 2, 1e-4),
+        (ej.EnergyMomentumDecaying(0.5), 2, 1e-5),
+        (ej.Composed(ej.EnergyPreserving(), 4), 4, 1e-7),
+        (ej.EnergyConsistent(0.0), 4, 1e-7),
+    ],
+)  # fmt: skip
+def test_the_order_on_a_four_bar_of_beams(scheme, order, bound):
+    """Beside an explicit method of order 8, of the same elements without constraints."""
+    pins = np.array([[0.0, 0.0], [2.0, 1.0], [3.5, 1.0], [2.5, 0.0]])
+    numbers = dict(EA=8e4, GA=3e4, EI=300.0, rhoA=100.0, rhoI=1.0)
+    section, names = ej.Section(**numbers), ("crank", "coupler", "rocker")
+    bars = crank, coupler, rocker = [
+        ej.bodies.Beam(name, pins[k : k + 2], section, 2) for k, name in enumerate(names)
+    ]
+    scene = ej.Scene(
+        [
+            *bars,
+            ej.joints.Revolute("A", "ground", crank.start),
+            ej.joints.Revolute("B", crank.end, coupler.start),
+            ej.joints.Revolute("C", coupler.end, rocker.start),
+            ej.joints.Revolute("D", "ground", rocker.end, pins[3]),
+        ],
+        gravity=[0.0, -9.81],
+    )
+    system, start, args = scene.build()
+    t, errors = 0.3, []
+    exact = four_bar_of_beams(t, pins, **numbers)
+    assert np.abs(exact - start.q).max() > 0.5
+    for steps in (120, 240):
+        # Beyond the time `t` with the longer steps: the runs share a program.
         sol = ej.simulate(
-            scene.system, ej.EnergyPreserving(), scene.start(), args, h=0.02, num_steps=20
+            system, scheme, start, args, h=t / steps, num_steps=240, throw=False
+        )
+        errors.append(float(np.abs(sol.ys.q[steps] - exact).max()))
+    assert errors[1] < bound  # truncation
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.3)
+
+
+@pytest.mark.slow
+def test_a_motion_has_gradients_by_stiffness_load_and_mass():
+    """Of a cantilever with a weight at its tip, beside differences of the same program."""
+    section = ej.Section(EA=1e3, GA=1e3, EI=2.0, rhoA=1.0, rhoI=1e-2)
+    beam, scene = _cantilever(
+        [[0.0, 0.0], [1.0, 0.0]],
+        section,
+        4,
+        ej.bodies.PointMass("weight", 0.3, [1.0, 0.0]),
+        ej.joints.Spherical("screw", "beam:end", "weight"),
+        ej.forces.ConstantForce("load", "beam:end", [0.0, 0.0]),
+    )
+    system, start, args = scene.build()
+
+    @jax.jit
+    @jax.value_and_grad
+    def tip(x):
+        EI, load, mass = x
+        loaded = args.set("load", force=load * jnp.array([0.0, 1.0]))
+        moved = loaded.set("beam", EI=EI).set("weight", mass=mass)
+        sol = ej.simulate(
+            system, ej.EnergyPreserving(), start, moved, h=0.02, num_steps=50, throw=False
         )
         return scene.position(sol.ys, beam.end)[-1, 1]
 
-    slope = jax.grad(tip)(2.0)
-    difference = (tip(2.0 + 1e-4) - tip(2.0 - 1e-4)) / 2e-4
-    np.testing.assert_allclose(slope, difference, rtol=1e-6)
+    at = np.array([2.0, -1.0, 0.3])
+    slopes = tip(at)[1]
+    for k, slope in enumerate(slopes):
+        step = 1e-4 * abs(at[k]) * np.eye(3)[k]
+        difference = lambda step: float(tip(at + step)[0] - tip(at - step)[0])
+        # Two quotients, without the error of second order.
+        expected = (8 * difference(step) - difference(2 * step)) / (12 * step[k])
+        np.testing.assert_allclose(slope, expected, rtol=1e-7)  # round-off of differences
 
 
 # Modes ------------------------------------------------------------------------------------
@@ -361,6 +449,104 @@ def test_axial_vibrations_of_a_clamped_beam():
     error = (np.pi / 4 * 0.2) ** 2 / 24
     nearest = found[jnp.argmin(jnp.abs(found - exact))]
     assert float(jnp.abs(nearest / exact - 1)) == pytest.approx(error, rel=0.2)
+
+
+def _frequencies_under_load(section, length, force, count):
+    """Of a beam on a pin and a roller: one half wave, and more, in closed form.
+
+    The beam can be sheared, and its axial force turns with the sections. Without shear and
+    inertia of rotation these are `(n pi / L)^2 sqrt(EI / rhoA) sqrt(1 + N L^2 / (n^2 pi^2
+    EI))`.
+    """
+    EA, GA, EI, rhoA, rhoI = (
+        section.numbers[k] for k in ("EA", "GA", "EI", "rhoA", "rhoI")
+    )
+    stretch, found = 1 + force / EA, []
+    for n in range(1, count + 1):
+        k = n * np.pi / length
+        both = (force - GA * stretch) * k
+        turning = GA * stretch**2 + EI * k**2 - force * stretch
+        stiffness = np.array([[GA * k**2, both], [both, turning]])
+        squares = scipy.linalg.eigh(stiffness, np.diag([rhoA, rhoI]), eigvals_only=True)
+        found.append(np.sqrt(squares[0]))
+    return np.array(found)
+
+
+def test_modes_about_a_loaded_equilibrium():
+    """A pull and half of the critical load, on a beam on a pin and a roller."""
+    section = ej.Section(EA=2e4, GA=8e3, EI=50.0, rhoA=2.0, rhoI=0.01)
+    length, errors = 4.0, []
+    critical = np.pi**2 * 50.0 / length**2
+    for elements in (16, 32):
+        beam = ej.bodies.Beam("beam", [[0.0, 0.0], [length, 0.0]], section, elements)
+        scene = ej.Scene([
+            beam,
+            ej.joints.Revolute("pin", "ground", beam.start),
+            ej.joints.OnCurve("roller", "ground", beam.end, lambda x, numbers: x[1:]),
+            ej.forces.ConstantForce("load", beam.end, [0.0, 0.0]),
+        ])  # fmt: skip
+        for force in (200.0, -0.5 * critical):
+            args = scene.args.set("load", force=jnp.array([force, 0.0]))
+            found = ej.equilibrium(scene.system, scene.start(), args)
+            frequencies = ej.modes(scene.system, found.state, args).frequencies[:2]
+            exact = _frequencies_under_load(section, length, force, 2)
+            errors.append(frequencies / exact - 1)
+    errors = np.array(errors).reshape(2, 2, 2)
+    # The load halves the lowest frequency and more, and triples it.
+    alone = _frequencies_under_load(section, length, 0.0, 1)[0]
+    assert _frequencies_under_load(section, length, 200.0, 1)[0] > 2.5 * alone
+    assert _frequencies_under_load(section, length, -0.5 * critical, 1)[0] < 0.75 * alone
+    assert np.abs(errors[1]).max() < 2.5e-3  # truncation
+    ratios = errors[0, :, 0] / errors[1, :, 0]
+    np.testing.assert_allclose(ratios, 4.0, rtol=0.05)  # of second order
+
+
+def _frequencies_of_a_ring(section, n):
+    """Of `n` waves out of the plane and in it, for a ring of radius one that is a straight
+    rod without stress, in closed form; the section has equal stiffnesses of bending."""
+    EA, GA, EI, GJ, rhoA, rhoI = (
+        section.numbers[k] for k in ("EA", "GA", "EI", "GJ", "rhoA", "rhoI")
+    )  # fmt: skip
+    square = lambda x: np.outer(x, x)
+    lowest = lambda K, M: np.sqrt(scipy.linalg.eigh(K, np.diag(M), eigvals_only=True)[0])
+    # Deflection, twist, and rotation about the radius. The last terms are those of the
+    # moment of the bent rod.
+    w, twist, turn = np.eye(3)
+    stiffness = (
+        GA * square(turn - n * w)
+        + GJ * square(n * twist + turn)
+        + EI * square(n * turn + twist)
+        - EI * (square(twist) + square(turn))
+        - EI * n * (np.outer(twist, turn) + np.outer(turn, twist))
+    )
+    out_of_plane = lowest(stiffness, [rhoA, 2 * rhoI, rhoI])
+    # Displacements along the ring and inwards, and the rotation.
+    u, v, turn = np.eye(3)
+    stiffness = (
+        EA * square(n * u - v) + GA * square(u - n * v - turn) + EI * square(n * turn)
+    )
+    return np.array([out_of_plane, lowest(stiffness, [rhoA, rhoA, rhoI])])
+
+
+@pytest.mark.slow
+def test_modes_of_a_straight_rod_that_is_bent_to_a_ring():
+    """Its moment changes the frequencies out of the plane, and it can be turned inside
+    out without energy."""
+    section = ej.Section(EA=2e5, GA=8e4, EI=50.0, GJ=40.0, rhoA=2.0, rhoI=0.02)
+    axis = lambda u: jnp.stack([jnp.cos(2 * np.pi * u), jnp.sin(2 * np.pi * u), 0.0 * u])
+    exact, errors = _frequencies_of_a_ring(section, 2), []
+    for elements in (16, 32):
+        beam = ej.bodies.Beam("beam", axis, section, elements)
+        scene = ej.Scene([beam, ej.joints.Fixed("weld", beam.end, beam.start)])
+        straight = scene.args["beams"]["beam"]["reference"].at[:, 3:].set(0.0)
+        args = scene.args.set("beam", reference=straight)
+        found = ej.modes(scene.system, scene.start(), args).frequencies
+        # Six rigid motions, and the ring turned inside out.
+        assert jnp.abs(found[:7]).max() < 1e-2  # the root of round-off
+        in_plane, out_of_plane = jnp.mean(found[7:9]), jnp.mean(found[9:11])
+        errors.append(np.array([out_of_plane, in_plane]) / exact - 1)
+    assert np.abs(errors[1]).max() < 0.015  # truncation
+    np.testing.assert_allclose(errors[0] / errors[1], 4.0, rtol=0.05)  # of second order
 
 
 def test_a_straight_beam_has_the_inertia_of_a_rod():
