@@ -126,11 +126,13 @@ def _select(which, *cases, **_):
 
 
 _FUNCTIONS: dict[str, Callable] = {
+    "abs": np.abs,
     "add": np.add,
     "and": np.bitwise_and,
     "eq": np.equal,
     "ge": np.greater_equal,
     "gt": np.greater,
+    "is_finite": np.isfinite,
     "le": np.less_equal,
     "lt": np.less,
     "max": np.maximum,
@@ -138,7 +140,9 @@ _FUNCTIONS: dict[str, Callable] = {
     "mul": np.multiply,
     "ne": np.not_equal,
     "neg": np.negative,
+    "not": np.invert,
     "or": np.bitwise_or,
+    "sqrt": np.sqrt,
     "sub": np.subtract,
 }
 

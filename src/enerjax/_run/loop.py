@@ -1,5 +1,7 @@
 """The loop over the steps of a run."""
 
+import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -10,17 +12,18 @@ from jaxtyping import Array, PyTree
 
 from .._operators import AbstractModel
 from .._programs import in_any_lane
-from .._results import first_failure, RESULTS
-from .._solvers import ChordAlone, RootFinder
+from .._results import first_failure, may_need_newton, RESULTS
+from .._solvers import ChordAlone, Newton, RootFinder
 from .._system import State
 from .._types import Count, Flag, Multipliers, Scalar
-from ..schemes import AbstractScheme, Energies
+from ..schemes import AbstractScheme, AbstractSchemeWithChord, Energies
 from .event_search import Found, no_search, settle, Watch
 from .halving import select
-from .reverse import keep_roots, loops
+from .reverse import Bodies, keep_roots, loops
 from .saving import Begin, Costs, Record, with_time
 from .step import advance, first_warm, model_for, StepOutput, Warm
-from .step_sizes import AbstractPlan, Verdict
+from .stage import num_unknowns
+from .step_sizes import AbstractPlan, EqualPlan, Verdict
 from .watcher import Happening, Watcher
 
 
@@ -43,7 +46,7 @@ class Progress(eqx.Module):
 
 
 class Stepper(eqx.Module):
-    """What all steps of a run have in common."""
+    """What all steps of a run have in common; for `may_have_lanes` see `Task`."""
 
     scheme: AbstractScheme
     model: AbstractModel
@@ -51,6 +54,7 @@ class Stepper(eqx.Module):
     root_finder: RootFinder | ChordAlone
     max_halvings: int | None = eqx.field(static=True)
     watcher: Watcher | None = None
+    may_have_lanes: bool = eqx.field(static=True, default=True)
 
     def model_at(self, progress: Progress) -> AbstractModel:
         """The model that events have left."""
@@ -334,11 +338,12 @@ def run_loop(
         num_groups, steps_in_group, None if plan.is_counted else is_done
     )
 
-    def one_step(progress: Progress, live: Flag) -> tuple[Progress, Attempt]:
+    def one_step(stepper: Stepper, progress: Progress, live: Flag):
         return stepper.attempt(progress, live & ~is_done(progress))
 
-    def one_group(before: Progress, live: Flag) -> tuple[Progress, Record]:
-        after, attempts = over_steps(keep_roots(one_step), before, steps_in_group, live)
+    def one_group(stepper: Stepper, before: Progress, live: Flag):
+        steps = bodies(stepper, one_step)
+        after, attempts = over_steps(steps, before, steps_in_group, live)
         numbers = jnp.arange(steps_in_group)
         last = jnp.max(jnp.where(attempts.accepted, numbers, 0))
         return after, Record(
@@ -354,18 +359,57 @@ def run_loop(
         )
 
     begin = stepper.begin(start)
+    other = for_lanes(stepper, begin)
+
+    def bodies(own: Stepper, body: Callable) -> Bodies:
+        in_lanes = None
+        if own is stepper and other is not None:
+            in_lanes = functools.partial(body, other)
+        return Bodies(keep_roots(functools.partial(body, own)), in_lanes, search_fails)
+
     kept = Begin(
         kept=keep(stepper.model_at(begin))(begin.state, begin.place),
         multipliers=begin.multipliers,
         varying=begin.varying,
     )
-    end, record = over_groups(one_group, begin, num_groups, jnp.array(True))
+    end, record = over_groups(
+        bodies(stepper, one_group), begin, num_groups, jnp.array(True)
+    )
     is_whole_run = end.place >= plan.last
     if end.watch is not None:
         is_whole_run = is_whole_run | end.watch.ended
     arrived = RESULTS.where(is_whole_run, RESULTS.successful, RESULTS.out_of_steps)
     result = first_failure(end.result, arrived)
     return kept, eqx.tree_at(lambda x: x.result, end, result), record
+
+
+# The largest number of unknowns of a step that is computed for many lanes side by side.
+_MANY_IN_LANES = 64
+
+
+def for_lanes(stepper: Stepper, begin: Progress) -> Stepper | None:
+    """The steps for lanes of a batch side by side, which have no exact Jacobian.
+
+    Lanes whose steps need it are computed again with it.
+    """
+    newton, stage, model = stepper.root_finder, stepper.scheme.stage, stepper.model
+    stage_memory = jax.tree.map(lambda x: x[0], begin.warm.stages)
+    if (
+        not (isinstance(newton, Newton) and newton.linear_solver is None)
+        or not (stepper.may_have_lanes and isinstance(stepper.plan, EqualPlan))
+        or not isinstance(stage, AbstractSchemeWithChord)
+        or not model.has_delassus_matrix
+        or stepper.watcher is not None
+        or model.system.redundant
+        or num_unknowns(stage_memory) > _MANY_IN_LANES
+    ):
+        return None
+    return dataclasses.replace(stepper, root_finder=ChordAlone(newton, if_small=True))
+
+
+def search_fails(before: Progress, after: Progress) -> Flag:
+    """Whether a step between two states has failed, perhaps for want of Newton's method."""
+    return (before.result == RESULTS.successful) & may_need_newton(after.result)
 
 
 def _check_start(

@@ -9,7 +9,7 @@ and repeat Newton's method, so that their memory grows like `sqrt(n)`.
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -24,8 +24,21 @@ from .._types import Flag
 LONG = 10_000
 
 Body: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]
-# `scan(body, carry, count, live)` calls `body(carry, live)` `count` times.
-Scan: TypeAlias = Callable[[Body, Any, int, Flag], tuple[Any, Any]]
+
+
+class Bodies(NamedTuple):
+    """The body of a loop, and the one for the lanes of a batch, if there is one.
+
+    `has_failed(before, after)` says whether it has failed in passes between two carries.
+    """
+
+    body: Body
+    in_lanes: Body | None
+    has_failed: Callable[[Any, Any], Flag]
+
+
+# `scan(bodies, carry, count, live)` calls `body(carry, live)` `count` times.
+Scan: TypeAlias = Callable[[Bodies, Any, int, Flag], tuple[Any, Any]]
 
 
 # XLA cannot merge a recomputation with the original across the passes of a loop.
@@ -54,14 +67,15 @@ def loops(
     return in_segments, _scan
 
 
-def _scan(body: Body, carry: Any, count: int, live: Flag) -> tuple[Any, Any]:
-    return jax.lax.scan(lambda carry, _: body(carry, live), carry, None, length=count)
+def _scan(bodies: Bodies, carry: Any, count: int, live: Flag) -> tuple[Any, Any]:
+    turn = lambda carry, _: bodies.body(carry, live)
+    return jax.lax.scan(turn, carry, None, length=count)
 
 
 def _in_segments(
     total: int,
     length: int,
-    body: Body,
+    bodies: Bodies,
     carry: Any,
     count: int,
     live: Flag,
@@ -77,12 +91,21 @@ def _in_segments(
 
     # Whether a pass is live is computed within its segment. An array of flags for all
     # passes would take more memory than the reverse pass of a long run keeps.
-    def passes(carry: Any, inputs: tuple[Array, Flag]) -> tuple[Any, Any]:
+    def passes(body: Body, carry: Any, inputs: tuple[Array, Flag]) -> tuple[Any, Any]:
         first, live = inputs
         one_pass = lambda carry, k: body(carry, live & (first + k < count))
         return jax.lax.scan(one_pass, carry, jnp.arange(size))
 
-    segment = in_one_function(keep_roots(passes))
+    in_lanes = None
+    if bodies.in_lanes is not None:
+        body = bodies.in_lanes
+
+        def in_lanes(carry: Any, inputs: tuple[Array, Flag]) -> tuple[Any, Flag]:
+            out = passes(body, carry, inputs)
+            return out, bodies.has_failed(carry, out[0])
+
+    whole = functools.partial(passes, bodies.body)
+    segment = in_one_function(keep_roots(whole), in_lanes)
     if total > LONG:
         segment = _checkpoint(segment)
     if done is not None:

@@ -10,6 +10,7 @@ import itertools
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeAlias
 
+import jax
 import numpy as np
 from jax import lax
 
@@ -67,7 +68,8 @@ class Graph:
     ) -> Number:
         """The result of an operation on scalars."""
         if all(isinstance(x, np.generic) for x in operands):
-            (value,) = evaluated(primitive, list(operands), params)
+            with jax.ensure_compile_time_eval():
+                (value,) = evaluated(primitive, list(operands), params)
             return np.asarray(value).astype(dtype)[()]
         simplify = _SIMPLER.get(primitive.name)
         if simplify is not None:

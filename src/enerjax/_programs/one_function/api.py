@@ -8,18 +8,26 @@ import jax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, PyTree
 
+from ..._types import Flag
 from .marks import APART, has_marks
 
 
-def in_one_function(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Array]]:
+def in_one_function(
+    fn: Callable[..., PyTree[Array]],
+    in_lanes: Callable[..., tuple[PyTree[Array], Flag]] | None = None,
+) -> Callable[..., PyTree[Array]]:
     """`fn`, between trees of arrays, as one function of machine code where it can be.
 
     The values are the same either way, but for round-off. Derivatives of any order are one
     function each, where that is possible; `jax.checkpoint` inside of `fn` decides which
     values they keep. The lanes of a batch run one after the other, each with the iterations
     that it needs.
+
+    With `in_lanes`, many lanes run side by side instead: it returns the same values by a
+    shorter program, and whether it has failed. Lanes for which it has failed are computed
+    again by `fn`, and so are derivatives.
     """
-    return _called(fn, is_part=False)
+    return _called(fn, is_part=False, in_lanes=in_lanes)
 
 
 def part(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Array]]:
@@ -28,18 +36,20 @@ def part(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Array]]:
     It is a function of its own only if the whole is none, for example because it is long:
     the time of compilation grows faster than the length of a function.
     """
-    return _called(fn, is_part=True)
+    return _called(fn, is_part=True, in_lanes=None)
 
 
 def _called(
-    fn: Callable[..., PyTree[Array]], is_part: bool
+    fn: Callable[..., PyTree[Array]],
+    is_part: bool,
+    in_lanes: Callable[..., tuple[PyTree[Array], Flag]] | None,
 ) -> Callable[..., PyTree[Array]]:
     if not has_marks():
         return fn
     # Imported here, because other versions of JAX may define primitives in another way.
-    from .program import call
+    from .lanes import call
 
-    return functools.partial(call, fn, is_part)
+    return functools.partial(call, fn, is_part, in_lanes)
 
 
 def unmerged(fn: Callable[..., tuple[Array, ...]]) -> Callable[..., tuple[Array, ...]]:

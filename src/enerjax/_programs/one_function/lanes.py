@@ -1,0 +1,190 @@
+"""Batches of programs that are one function: one lane after the other, or side by side."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array
+
+from .program import call as call, merged, ONE_FUNCTION, Program, run_closed, split
+
+
+# The fewest lanes that run side by side.
+_FEWEST = 16
+# The most lanes side by side: the numbers of more would not fit into the cache.
+_WIDEST = 64
+# Lanes side by side are a multiple of this number, the width of vector registers.
+_ROUND = 8
+
+
+def _lanes(numbers: Any, axes: Any, *, program: Program) -> tuple[list, list[int]]:
+    batched = [axis is not None for axis in axes]
+    own = [
+        x if axis is None else jnp.moveaxis(x, axis, 0)
+        for x, axis in zip(numbers, axes, strict=True)
+    ]
+    size = next(len(x) for x, on in zip(own, batched, strict=True) if on)
+    out = None
+    if size >= _FEWEST and not any(map(_is_sharded, own)):
+        if _side_by_side(program) is not None:
+            out = IN_LANES.bind(*own, program=program, batched=tuple(batched))
+    if out is None:
+        out = _in_turn(program, program.own(own), program.own(batched))
+    return out, [0] * len(out)
+
+
+def _in_turn(
+    program: Program, numbers: Sequence[Array], batched: Sequence[bool]
+) -> list[Array]:
+    """The lanes of a program, each with the iterations that it needs."""
+    own, shared = split(batched, numbers)
+    of_lane = lambda own: program(merged(batched, own, shared))
+    still = len(batched) - program.linear
+    if any(map(_is_sharded, own)) or not program.is_possible:
+        # Each device computes its own lanes.
+        return jax.vmap(of_lane)(own)
+    if program.linear and not any(batched[:still]):
+        # Many directions at one point share everything but the directions themselves.
+        closed = jax.make_jaxpr(jax.vmap(of_lane))(own)
+        wanted = [True] * len(closed.out_avals)
+        return run_closed(closed, own, wanted, program.is_part, len(own))
+    # The lanes run one after the other. With few lanes side by side, calling the operations
+    # would take longer than a whole lane in one function; many lanes side by side do not
+    # fit into the cache.
+    closed = jax.make_jaxpr(lambda own: jax.lax.map(of_lane, own))(own)
+    return run_closed(closed, own, [True] * len(closed.out_avals), program.is_part)
+
+
+def _is_sharded(x: Array) -> bool:
+    """Whether an array is sharded over axes of a mesh that its type names."""
+    return any(axis is not None for axis in jax.typeof(x).sharding.spec)
+
+
+batching.primitive_batchers[ONE_FUNCTION] = _lanes
+
+
+# Lanes side by side ------------------------------------------------------------------------
+
+IN_LANES = Primitive("enerjax_in_lanes")
+IN_LANES.multiple_results = True
+
+
+def _side_by_side(program: Program) -> Callable[[Sequence[Array]], list[Array]] | None:
+    """The program for lanes, if there is one and it has only operations that are possible."""
+    if program.in_lanes is None:
+        return None
+    return program.in_lanes.function
+
+
+def _in_chunks(
+    numbers: Sequence[Array], program: Program, batched: Sequence[bool]
+) -> tuple[list[Array], Array]:
+    """The results of all lanes side by side, and for which lanes they are none."""
+    fn = _side_by_side(program)
+    assert fn is not None
+    count = len(program.known)
+    numbers, batched = numbers[count:], batched[count:]
+    own, shared = split(batched, numbers)
+    lanes = len(own[0])
+    chunks = -(-lanes // _WIDEST)
+    width = -(-lanes // (chunks * _ROUND)) * _ROUND
+    chosen = np.minimum(np.arange(chunks * width), lanes - 1)
+
+    def columns(x: Array) -> Array:
+        x = x[chosen] if chosen.size > lanes else x
+        return jnp.swapaxes(x.reshape(chunks, width, x.size // len(x)), 1, 2)
+
+    rows = [jnp.broadcast_to(x.reshape(-1, 1), (x.size, width)) for x in shared]
+    found = jax.lax.map(
+        lambda own: fn(merged(batched, own, rows)), list(map(columns, own))
+    )
+    shapes = [x.aval.shape for x in program.jaxpr.outvars]
+    *out, failed = (
+        jnp.moveaxis(x, -1, 1).reshape(chunks * width, *shape)[:lanes]
+        for x, shape in zip(found, [*shapes, ()], strict=True)
+    )
+    return out, failed
+
+
+def _with_failed_again(
+    *numbers: Array, program: Program, batched: Sequence[bool]
+) -> list[Array]:
+    out, failed = _in_chunks(numbers, program, batched)
+    batched, numbers = program.own(batched), program.own(numbers)
+    own, shared = split(batched, numbers)
+
+    def of_lane(inputs: tuple[Array, list[Array], list[Array]]) -> list[Array]:
+        failed, found, own = inputs
+        again = lambda: program(merged(batched, own, shared))
+        return jax.lax.cond(failed, again, lambda: found)
+
+    def again() -> list[Array]:
+        inputs = failed, out, own
+        closed = jax.make_jaxpr(lambda *inputs: jax.lax.map(of_lane, inputs))(*inputs)
+        wanted = [True] * len(closed.out_avals)
+        return run_closed(closed, jax.tree.leaves(inputs), wanted, program.is_part)
+
+    return jax.lax.cond(jnp.any(failed), again, lambda: out)
+
+
+@IN_LANES.def_impl
+def _evaluated(*numbers: Array, **params: Any) -> list[Array]:
+    return jax.jit(lambda *numbers: _with_failed_again(*numbers, **params))(*numbers)
+
+
+@IN_LANES.def_abstract_eval
+def _shapes(*numbers: Any, program: Program, batched: Sequence[bool]) -> list[Any]:
+    (lanes, *_), *_ = (x.shape for x, on in zip(numbers, batched, strict=True) if on)
+    return [x.aval.update(shape=(lanes, *x.aval.shape)) for x in program.jaxpr.outvars]
+
+
+def _jvp(
+    primals: Any, tangents: Any, *, program: Program, batched: Sequence[bool]
+) -> tuple[list, list]:
+    """Derivatives are those of lanes that run one after the other."""
+    batched = program.own(batched)
+    primals, tangents = program.own(primals), program.own(tangents)
+    has_tangent = [not isinstance(t, ad.Zero) for t in tangents]
+    moved, still = split(has_tangent, primals)
+    rates, _ = split(has_tangent, tangents)
+    run = lambda *moved: _in_turn(program, merged(has_tangent, moved, still), batched)
+    out, rates = jax.jvp(run, tuple(moved), tuple(rates))
+    zero = lambda x: ad.Zero(jax.typeof(x).to_tangent_aval())
+    is_smooth = lambda x: jnp.issubdtype(x.dtype, jnp.inexact)
+    pairs = zip(out, rates, strict=True)
+    return out, [t if is_smooth(x) else zero(x) for x, t in pairs]
+
+
+def _more_lanes(
+    numbers: Any, axes: Any, *, program: Program, batched: Sequence[bool]
+) -> tuple[list, list[int]]:
+    """A batch of batches, as one batch of all lanes."""
+    more = next(x.shape[k] for x, k in zip(numbers, axes, strict=True) if k is not None)
+    lanes = next(
+        x.shape[1 if k == 0 else 0]
+        for x, k, on in zip(numbers, axes, batched, strict=True)
+        if on
+    )
+
+    def joined(x: Array, axis: int | None, on: bool) -> Array:
+        if axis is None and not on:
+            return x
+        x = x[None] if axis is None else jnp.moveaxis(x, axis, 0)
+        x = x if on else x[:, None]
+        shape = x.shape[2:]
+        return jnp.broadcast_to(x, (more, lanes, *shape)).reshape(more * lanes, *shape)
+
+    numbers = list(map(joined, numbers, axes, batched))
+    joint = tuple(on or k is not None for on, k in zip(batched, axes, strict=True))
+    out = IN_LANES.bind(*numbers, program=program, batched=joint)
+    out = [x.reshape(more, lanes, *x.shape[1:]) for x in out]
+    return out, [0] * len(out)
+
+
+ad.primitive_jvps[IN_LANES] = _jvp
+batching.primitive_batchers[IN_LANES] = _more_lanes
+mlir.register_lowering(IN_LANES, mlir.lower_fun(_with_failed_again))
