@@ -145,7 +145,14 @@ def _mul(graph, operands, params, dtype):
 
 def _div(graph, operands, params, dtype):
     a, b = operands
-    return a if _is(b, 1) else dtype.type(0) if _is(a, 0) else None
+    if _is(b, 1) or _is(a, 0):
+        return a if _is(b, 1) else dtype.type(0)
+    if not np.issubdtype(dtype, np.inexact) or _is(a, 1):
+        return None
+    # Products with an inverse, which is shared by all that is divided by the same number,
+    # and which is computed before a loop where the number is.
+    one = dtype.type(1)
+    return graph.multiply(a, graph.number(lax.div_p, (one, b), params, dtype))
 
 
 def _neg(graph, operands, params, dtype):

@@ -1,69 +1,105 @@
 """Programs that are evaluated for many lanes."""
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, TypeAlias
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .emission import values_of
-from .entries import array_of, Entry, Graph, objects, Region
+from .emission import computed, value_of
+from .entries import array_of, Entry, Graph, Number, objects, Region
 from .evaluation import Evaluation, Stack, UnsupportedError
 from .kernels import has_kernels
+from .planning import plan_of
 
 
-def in_lanes(
-    jaxpr: Any, values: Sequence[np.ndarray | None]
-) -> Callable[[Sequence[Array]], list[Array]] | None:
+_Output: TypeAlias = list[Number] | Stack
+
+
+class ProgramInLanes:
     """A program as a function of arrays whose last axis is that of the lanes.
 
-    `jaxpr` takes its constants first. `values` are the inputs that are known; the function
-    takes the others. The result is `None` if an operation is not supported.
+    - `needed`: the numbers of the inputs that it takes, of those that are not known.
+    - `same`: for each output the number of the input that it is equal to, or `None`. Such
+      outputs are not computed.
+    """
+
+    def __init__(
+        self,
+        inputs: list[list[Entry]],
+        outputs: list[_Output],
+        avals: Sequence[Any],
+        region: Region,
+    ):
+        number = {id(x[0]): k for k, x in enumerate(inputs) if x}
+        of_input = lambda x: number.get(id(x[0])) if isinstance(x, list) and x else None
+        found = map(of_input, outputs)
+        self.same = [
+            k if k is not None and _are_same(inputs[k], x) else None
+            for k, x in zip(found, outputs, strict=True)
+        ]
+        pairs = zip(outputs, avals, self.same, strict=True)
+        self._computed = [(x, aval) for x, aval, same in pairs if same is None]
+        flat = (x for xs, _ in self._computed if isinstance(xs, list) for x in xs)
+        self._plan = plan_of(region, flat)
+        read = set(self._plan.inputs)
+        self.needed = [k for k, x in enumerate(inputs) if not read.isdisjoint(x)]
+        self._inputs = [inputs[k] for k in self.needed]
+
+    def __call__(self, arrays: Sequence[Array], size: int) -> list[Array]:
+        """The outputs that are not `same`, of `size` lanes, from the needed inputs."""
+        known = {
+            entry: row
+            for entries, array in zip(self._inputs, arrays, strict=True)
+            for entry, row in zip(entries, array.reshape(-1, size), strict=True)
+        }
+        known = computed(self._plan, known, size)
+        return [_array(x, known, size, aval) for x, aval in self._computed]
+
+
+def _are_same(entries: list[Entry], numbers: _Output) -> bool:
+    if isinstance(numbers, Stack) or len(entries) != len(numbers):
+        return False
+    return all(x is y for x, y in zip(entries, numbers, strict=True))
+
+
+def _array(x: _Output, known: dict[Entry, Array], size: int, aval: Any) -> Array:
+    shape = *aval.shape, size
+    if isinstance(x, Stack):
+        rows, axis = [known[entry] for entry in x.entries], 1
+    else:
+        rows, axis = [value_of(number, known, size) for number in x], 0
+    if not rows:
+        return jnp.zeros(shape, aval.dtype)
+    return jnp.stack(rows, axis=axis).reshape(shape).astype(aval.dtype)
+
+
+def in_lanes(jaxpr: Any, values: Sequence[np.ndarray | None]) -> ProgramInLanes | None:
+    """A program for many lanes; `None` if an operation is not supported.
+
+    `jaxpr` takes its constants first. `values` are the inputs that are known, and `None`
+    for the others.
     """
     if not has_kernels():
         return None
     region = Region()
-    variables = [*jaxpr.constvars, *jaxpr.invars]
-    inputs, arrays = [], []
-    for variable, value in zip(variables, values, strict=True):
-        if value is not None:
-            arrays.append(value)
-            continue
-        aval = variable.aval
-        entries = [Entry(aval.dtype, region) for _ in range(aval.size)]
-        inputs.append(entries)
-        arrays.append(array_of(entries, aval.shape, aval.dtype))
+    inputs: list[list[Entry]] = []
+    arrays = []
+    for variable, value in zip([*jaxpr.constvars, *jaxpr.invars], values, strict=True):
+        if value is None:
+            aval = variable.aval
+            inputs.append([Entry(aval.dtype, region) for _ in range(aval.size)])
+            value = array_of(inputs[-1], aval.shape, aval.dtype)
+        arrays.append(value)
     try:
         out = Evaluation(Graph(), region).outputs(jaxpr, arrays)
     except UnsupportedError:
         return None
-    numbers = [_numbers(x) for x in out]
-
-    def program(arrays: Sequence[Array]) -> list[Array]:
-        size = arrays[0].shape[-1]
-        known = {
-            entry: row
-            for entries, array in zip(inputs, arrays, strict=True)
-            for entry, row in zip(entries, array.reshape(-1, size), strict=True)
-        }
-        flat = [x for entries in numbers if isinstance(entries, list) for x in entries]
-        found, known = values_of(region, flat, known, size)
-        remaining, results = iter(found), []
-        for entries, var in zip(numbers, jaxpr.outvars, strict=True):
-            if isinstance(entries, Stack):
-                rows = [known[x] for x in entries.entries]
-                array = jnp.stack(rows, axis=1) if rows else jnp.zeros((0,))
-            else:
-                rows = [next(remaining) for _ in entries]
-                array = jnp.stack(rows) if rows else jnp.zeros((0,))
-            results.append(array.reshape(*var.aval.shape, size).astype(var.aval.dtype))
-        return results
-
-    return program
+    avals = [x.aval for x in jaxpr.outvars]
+    return ProgramInLanes(inputs, list(map(_numbers, out)), avals, region)
 
 
-def _numbers(x: np.ndarray) -> Any:
-    (first,) = x.ravel() if x.ndim == 0 else (None,)
+def _numbers(x: np.ndarray) -> _Output:
+    first = x[()] if x.ndim == 0 else None
     return first if isinstance(first, Stack) else list(objects(x).ravel())

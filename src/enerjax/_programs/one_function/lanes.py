@@ -1,7 +1,7 @@
 """Batches of programs that are one function: one lane after the other, or side by side."""
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,9 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
 from .program import call as call, merged, ONE_FUNCTION, Program, run_closed, split
+
+if TYPE_CHECKING:
+    from ..entrywise import ProgramInLanes
 
 
 # The fewest lanes that run side by side.
@@ -73,7 +76,7 @@ IN_LANES = Primitive("enerjax_in_lanes")
 IN_LANES.multiple_results = True
 
 
-def _side_by_side(program: Program) -> Callable[[Sequence[Array]], list[Array]] | None:
+def _side_by_side(program: Program) -> "ProgramInLanes | None":
     """The program for lanes, if there is one and it has only operations that are possible."""
     if program.in_lanes is None:
         return None
@@ -88,8 +91,10 @@ def _in_chunks(
     assert fn is not None
     count = len(program.known)
     numbers, batched = numbers[count:], batched[count:]
-    own, shared = split(batched, numbers)
-    lanes = len(own[0])
+    lanes = next(len(x) for x, on in zip(numbers, batched, strict=True) if on)
+    needed = [numbers[k] for k in fn.needed]
+    is_own = [batched[k] for k in fn.needed]
+    own, shared = split(is_own, needed)
     chunks = -(-lanes // _WIDEST)
     width = -(-lanes // (chunks * _ROUND)) * _ROUND
     chosen = np.minimum(np.arange(chunks * width), lanes - 1)
@@ -100,13 +105,21 @@ def _in_chunks(
 
     rows = [jnp.broadcast_to(x.reshape(-1, 1), (x.size, width)) for x in shared]
     found = jax.lax.map(
-        lambda own: fn(merged(batched, own, rows)), list(map(columns, own))
+        lambda own: fn(merged(is_own, own, rows), width), list(map(columns, own))
     )
-    shapes = [x.aval.shape for x in program.jaxpr.outvars]
-    *out, failed = (
-        jnp.moveaxis(x, -1, 1).reshape(chunks * width, *shape)[:lanes]
-        for x, shape in zip(found, [*shapes, ()], strict=True)
+    # The axis of the lanes of a chunk becomes the second one.
+    found = (
+        jnp.moveaxis(x, -1, 1).reshape(chunks * width, *x.shape[1:-1])[:lanes]
+        for x in found
     )
+
+    def output(same: int | None) -> Array:
+        if same is None:
+            return next(found)
+        x = numbers[same]
+        return x if batched[same] else jnp.broadcast_to(x, (lanes, *x.shape))
+
+    *out, failed = map(output, fn.same)
     return out, failed
 
 

@@ -113,8 +113,8 @@ class InLanes:
         self.numbers = [x for x in needed if isinstance(x, Tracer)]
 
     @functools.cached_property
-    def function(self) -> Callable[[Sequence[Array]], list[Array]] | None:
-        """A function of arrays whose last axis is that of the lanes, if it is possible."""
+    def function(self) -> "ProgramInLanes | None":
+        """The program, entry by entry, of its inputs that are not known; if possible."""
         from ..entrywise import in_lanes
 
         return in_lanes(self.jaxpr, self.known)
