@@ -364,7 +364,7 @@ def run_loop(
     def bodies(own: Stepper, body: Callable) -> Bodies:
         in_lanes = None
         if own is stepper and other is not None:
-            in_lanes = functools.partial(body, other)
+            in_lanes = lambda *inputs: body(other(), *inputs)
         return Bodies(keep_roots(functools.partial(body, own)), in_lanes, search_fails)
 
     kept = Begin(
@@ -387,7 +387,7 @@ def run_loop(
 _MANY_IN_LANES = 64
 
 
-def for_lanes(stepper: Stepper, begin: Progress) -> Stepper | None:
+def for_lanes(stepper: Stepper, begin: Progress) -> Callable[[], Stepper] | None:
     """The steps for lanes of a batch side by side, which have no exact Jacobian.
 
     Lanes whose steps need it are computed again with it.
@@ -404,7 +404,12 @@ def for_lanes(stepper: Stepper, begin: Progress) -> Stepper | None:
         or num_unknowns(stage_memory) > _MANY_IN_LANES
     ):
         return None
-    return dataclasses.replace(stepper, root_finder=ChordAlone(newton, if_small=True))
+    # The zeros must become known where the steps are traced.
+    return lambda: dataclasses.replace(
+        stepper,
+        model=model.with_known_zeros(begin.state),
+        root_finder=ChordAlone(newton, if_small=True),
+    )
 
 
 def search_fails(before: Progress, after: Progress) -> Flag:

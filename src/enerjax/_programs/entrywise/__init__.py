@@ -4,4 +4,8 @@ Every number of a lane is a vector over the lanes, so that operations on structu
 known numbers are left out, and loops over lanes use all entries of a vector register.
 """
 
-from .lanes import in_lanes as in_lanes, ProgramInLanes as ProgramInLanes
+from .lanes import (
+    in_lanes as in_lanes,
+    known_zeros as known_zeros,
+    ProgramInLanes as ProgramInLanes,
+)

@@ -1,11 +1,13 @@
 """Programs that are evaluated for many lanes."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jax.core import Tracer
+from jaxtyping import Array, PyTree
 
 from .emission import computed, value_of
 from .entries import array_of, Entry, Graph, Number, objects, Region
@@ -81,8 +83,32 @@ def in_lanes(jaxpr: Any, values: Sequence[np.ndarray | None]) -> ProgramInLanes 
     `jaxpr` takes its constants first. `values` are the inputs that are known, and `None`
     for the others.
     """
-    if not has_kernels():
+    found = _evaluated(jaxpr, values) if has_kernels() else None
+    if found is None:
         return None
+    region, inputs, outputs = found
+    avals = [x.aval for x in jaxpr.outvars]
+    return ProgramInLanes(inputs, list(map(_numbers, outputs)), avals, region)
+
+
+def known_zeros(fn: Callable[[], PyTree[Array]]) -> PyTree[np.ndarray]:
+    """Which entries of the arrays that `fn` returns are zero whatever it depends on."""
+    closed, like = jax.make_jaxpr(fn, return_shape=True)()
+    values = [None if isinstance(x, Tracer) else np.asarray(x) for x in closed.consts]
+    found = _evaluated(closed.jaxpr, values)
+    outputs = closed.out_avals if found is None else found[2]
+    is_zero = lambda x: isinstance(x, np.generic) and x == 0
+    masks = (np.zeros(x.shape, bool) for x in outputs)
+    if found is not None:
+        flat = (map(is_zero, objects(x).ravel()) for x in outputs)
+        masks = (np.array(list(x), bool).reshape(y.shape) for x, y in zip(flat, outputs))
+    return jax.tree.unflatten(jax.tree.structure(like), list(masks))
+
+
+def _evaluated(
+    jaxpr: Any, values: Sequence[np.ndarray | None]
+) -> tuple[Region, list[list[Entry]], list[np.ndarray]] | None:
+    """A program evaluated entry by entry, with the entries of its unknown inputs."""
     region = Region()
     inputs: list[list[Entry]] = []
     arrays = []
@@ -93,11 +119,9 @@ def in_lanes(jaxpr: Any, values: Sequence[np.ndarray | None]) -> ProgramInLanes 
             value = array_of(inputs[-1], aval.shape, aval.dtype)
         arrays.append(value)
     try:
-        out = Evaluation(Graph(), region).outputs(jaxpr, arrays)
+        return region, inputs, Evaluation(Graph(), region).outputs(jaxpr, arrays)
     except UnsupportedError:
         return None
-    avals = [x.aval for x in jaxpr.outvars]
-    return ProgramInLanes(inputs, list(map(_numbers, out)), avals, region)
 
 
 def _numbers(x: np.ndarray) -> _Output:
