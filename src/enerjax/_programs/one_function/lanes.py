@@ -19,9 +19,10 @@ if TYPE_CHECKING:
 # The fewest lanes that run side by side.
 _FEWEST = 16
 # The most lanes side by side: the numbers of more would not fit into the cache.
-_WIDEST = 64
+_WIDEST = 104
 # Lanes side by side are a multiple of this number, the width of vector registers.
 _ROUND = 8
+_ALIASED = 64
 
 
 def _lanes(numbers: Any, axes: Any, *, program: Program) -> tuple[list, list[int]]:
@@ -97,6 +98,8 @@ def _in_chunks(
     own, shared = split(is_own, needed)
     chunks = -(-lanes // _WIDEST)
     width = -(-lanes // (chunks * _ROUND)) * _ROUND
+    # Vectors whose length is a power of two share few places of the cache.
+    width += _ROUND if width % _ALIASED == 0 else 0
     chosen = np.minimum(np.arange(chunks * width), lanes - 1)
 
     def columns(x: Array) -> Array:
