@@ -159,6 +159,8 @@ class Evaluation:
             return [self._scattered(name, values, params, avals[0])]
         if name == "dynamic_slice" and any(_is_unknown(x) for x in values[1:]):
             return [self._chosen_slice(values, params, avals[0])]
+        if name == "gather" and _is_unknown(values[1]):
+            return [self._chosen_places(primitive, values, params, avals[0])]
         if name == "dynamic_update_slice":
             return [_updated(*values, aval=avals[0])]
         if name in DATA_MOVEMENT and name != "tile":
@@ -247,6 +249,38 @@ class Evaluation:
             choose = lambda old, new, beyond=beyond: self.graph.chosen(beyond, old, new)
             out = list(map(choose, out, part(k)))
         return array_of(out, aval.shape, aval.dtype)
+
+    def _chosen_places(
+        self, primitive: Any, values: list[Any], params: Any, aval: Any
+    ) -> np.ndarray:
+        """A gather of places of which one coordinate differs from lane to lane."""
+        x, index = map(objects, values)
+        numbers, graph = params["dimension_numbers"], self.graph
+        unknown = np.vectorize(lambda k: isinstance(k, Entry), otypes=[bool])(index)
+        columns = np.flatnonzero(unknown.reshape(-1, index.shape[-1]).any(axis=0))
+        if len(columns) != 1:
+            raise UnsupportedError("gather")
+        (column,) = columns
+        axis = numbers.start_index_map[column]
+        room = x.shape[axis] - params["slice_sizes"][axis] + 1
+        if room > _FEW:
+            raise UnsupportedError("gather")
+        fills = params["mode"] == lax.GatherScatterMode.FILL_OR_DROP
+        inner = [k for k in range(len(aval.shape)) if k in numbers.offset_dims]
+        place = np.broadcast_to(np.expand_dims(index[..., column], inner), aval.shape)
+        place, kind = objects(place).ravel(), index.ravel()[0].dtype.type
+        missing = np.nan if np.issubdtype(aval.dtype, np.inexact) else 0
+        out = [np.dtype(aval.dtype).type(missing)] * aval.size if fills else None
+        for k in range(room):
+            known = np.array(index)
+            known[..., column] = k
+            (taken,) = moved(primitive, [x, known.astype(int)], params)
+            taken = list(np.ravel(taken))
+            compare = lax.eq_p if fills else lax.ge_p
+            is_it = (graph.number(compare, (y, kind(k)), {}, np.bool_) for y in place)
+            choices = zip(is_it, out or taken, taken, strict=True)
+            out = list(itertools.starmap(graph.chosen, choices))
+        return array_of(out or [], aval.shape, aval.dtype)
 
     def _moved(self, primitive: Any, values: list[Any], params: Any, avals: Any) -> Any:
         indices = DATA_MOVEMENT[primitive.name] == (0,)
