@@ -22,6 +22,9 @@ from .._types import Flag
 
 # With more steps than this the roots are not kept.
 LONG = 10_000
+# The fewest lanes of a batch, and steps of all its lanes together, for which the program for
+# lanes side by side is made: it takes seconds to compile.
+_FEWEST_LANES, _FEWEST_STEPS = 64, 20_000
 
 Body: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]
 
@@ -105,7 +108,8 @@ def _in_segments(
             return out, bodies.has_failed(carry, out[0])
 
     whole = functools.partial(passes, bodies.body)
-    segment = in_one_function(keep_roots(whole), in_lanes)
+    fewest = max(_FEWEST_LANES, -(-_FEWEST_STEPS // total))
+    segment = in_one_function(keep_roots(whole), in_lanes, fewest)
     if total > LONG:
         segment = _checkpoint(segment)
     if done is not None:

@@ -15,6 +15,7 @@ from .marks import APART, has_marks
 def in_one_function(
     fn: Callable[..., PyTree[Array]],
     in_lanes: Callable[..., tuple[PyTree[Array], Flag]] | None = None,
+    fewest_lanes: int = 1,
 ) -> Callable[..., PyTree[Array]]:
     """`fn`, between trees of arrays, as one function of machine code where it can be.
 
@@ -23,11 +24,11 @@ def in_one_function(
     values they keep. The lanes of a batch run one after the other, each with the iterations
     that it needs.
 
-    With `in_lanes`, many lanes run side by side instead: it returns the same values by a
-    shorter program, and whether it has failed. Lanes for which it has failed are computed
-    again by `fn`, and so are derivatives.
+    With `in_lanes`, batches of `fewest_lanes` or more run side by side instead: it returns
+    the same values by a shorter program, and whether it has failed. Lanes for which it has
+    failed are computed again by `fn`, and so are derivatives.
     """
-    return _called(fn, is_part=False, in_lanes=in_lanes)
+    return _called(fn, False, in_lanes, fewest_lanes)
 
 
 def part(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Array]]:
@@ -36,20 +37,21 @@ def part(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Array]]:
     It is a function of its own only if the whole is none, for example because it is long:
     the time of compilation grows faster than the length of a function.
     """
-    return _called(fn, is_part=True, in_lanes=None)
+    return _called(fn, True)
 
 
 def _called(
     fn: Callable[..., PyTree[Array]],
     is_part: bool,
-    in_lanes: Callable[..., tuple[PyTree[Array], Flag]] | None,
+    in_lanes: Callable[..., tuple[PyTree[Array], Flag]] | None = None,
+    fewest_lanes: int = 1,
 ) -> Callable[..., PyTree[Array]]:
     if not has_marks():
         return fn
     # Imported here, because other versions of JAX may define primitives in another way.
     from .lanes import call
 
-    return functools.partial(call, fn, is_part, in_lanes)
+    return functools.partial(call, fn, is_part, in_lanes, fewest_lanes)
 
 
 def unmerged(fn: Callable[..., tuple[Array, ...]]) -> Callable[..., tuple[Array, ...]]:

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from ..entrywise import ProgramInLanes
 
 
-# The fewest lanes that run side by side.
-_FEWEST = 16
 # The most lanes side by side: the numbers of more would not fit into the cache.
 _WIDEST = 104
 # Lanes side by side are a multiple of this number, the width of vector registers.
@@ -33,12 +31,17 @@ def _lanes(numbers: Any, axes: Any, *, program: Program) -> tuple[list, list[int
     ]
     size = next(len(x) for x, on in zip(own, batched, strict=True) if on)
     out = None
-    if size >= _FEWEST and not any(map(_is_sharded, own)):
+    if _is_worth(program, size) and not any(map(_is_sharded, own)):
         if _side_by_side(program) is not None:
             out = IN_LANES.bind(*own, program=program, batched=tuple(batched))
     if out is None:
         out = _in_turn(program, program.own(own), program.own(batched))
     return out, [0] * len(out)
+
+
+def _is_worth(program: Program, lanes: int) -> bool:
+    """Whether lanes run side by side, if that is possible."""
+    return program.in_lanes is not None and lanes >= program.in_lanes.fewest
 
 
 def _in_turn(

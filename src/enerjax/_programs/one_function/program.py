@@ -24,13 +24,16 @@ def call(
     fn: Callable[..., PyTree[Array]],
     is_part: bool,
     in_lanes: Callable[..., tuple[PyTree[Array], Flag]] | None,
+    fewest_lanes: int,
     *args: PyTree[Array],
 ) -> PyTree[Array]:
     """`fn(*args)` in one function, if it can be; for `in_lanes` see `in_one_function`."""
     closed, like = jax.make_jaxpr(fn, return_shape=True)(*args)
     wanted = [True] * len(closed.out_avals)
-    other = None if in_lanes is None else jax.make_jaxpr(in_lanes)(*args)
-    out = run_closed(closed, jax.tree.leaves(args), wanted, is_part, in_lanes=other)
+    lanes = None
+    if in_lanes is not None:
+        lanes = jax.make_jaxpr(in_lanes)(*args), fewest_lanes
+    out = run_closed(closed, jax.tree.leaves(args), wanted, is_part, in_lanes=lanes)
     return jax.tree.unflatten(jax.tree.structure(like), map(jnp.asarray, out))
 
 
@@ -104,9 +107,17 @@ class InLanes:
     - `jaxpr`: its outputs are those of the other program, and whether it has failed. Its
       constants are passed as the first inputs.
     - `known`: the values of the inputs that are known; `None` for those that are passed.
+    - `fewest`: the number of lanes from which the program is used.
     """
 
-    def __init__(self, closed: ClosedJaxpr, numbers: Sequence[Any], wanted: Sequence[bool]):
+    def __init__(
+        self,
+        closed: ClosedJaxpr,
+        numbers: Sequence[Any],
+        wanted: Sequence[bool],
+        fewest: int,
+    ):
+        self.fewest = fewest
         self.jaxpr, of_consts, of_inputs = dce_jaxpr_consts(closed.jaxpr, [*wanted, True])
         needed, _ = split([*of_consts, *of_inputs], [*closed.consts, *numbers])
         self.known = [None if isinstance(x, Tracer) else np.asarray(x) for x in needed]
@@ -132,7 +143,7 @@ def run_closed(
     wanted: Sequence[bool],
     is_part: bool,
     linear: int = 0,
-    in_lanes: ClosedJaxpr | None = None,
+    in_lanes: tuple[ClosedJaxpr, int] | None = None,
 ) -> list[Any]:
     """The wanted outputs of a program, in one function where that is possible.
 
@@ -148,7 +159,8 @@ def run_closed(
     linear = sum(of_inputs[len(of_inputs) - linear :])
     lanes, more = None, []
     if in_lanes is not None:
-        lanes = InLanes(in_lanes, inputs, computed)
+        other, fewest = in_lanes
+        lanes = InLanes(other, inputs, computed, fewest)
         # They are passed on, and not kept: a program can outlive the trace of its inputs.
         more, lanes.numbers = lanes.numbers, []
     program = Program(jaxpr, list(map(as_index, needed)), is_part, linear, lanes)
