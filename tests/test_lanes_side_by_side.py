@@ -83,7 +83,9 @@ def test_programs_entry_by_entry(fn):
         found = jax.jit(of_chosen)(*(inputs[k] for k in program.needed))
         expected = jax.tree.leaves(jax.vmap(fn)(x, ys))
         for array, other in zip(found, expected, strict=True):
-            np.testing.assert_allclose(np.moveaxis(array, -1, 0), other, rtol=1e-13, atol=1e-14)
+            np.testing.assert_allclose(
+                np.moveaxis(array, -1, 0), other, rtol=1e-13, atol=1e-14
+            )
 
 
 def test_what_lanes_cannot_do_is_left_to_other_programs():

@@ -27,6 +27,8 @@ from .jaxprs import (
 from .one_function.api import (
     in_one_function as in_one_function,
     part as part,
+    run_side_by_side as run_side_by_side,
+    SideBySide as SideBySide,
     unmerged as unmerged,
 )
 from .one_function.obstacles import why_not_one_function as why_not_one_function

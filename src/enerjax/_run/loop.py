@@ -362,10 +362,15 @@ def run_loop(
     other = for_lanes(stepper, begin)
 
     def bodies(own: Stepper, body: Callable) -> Bodies:
-        in_lanes = None
+        side_by_side = None
         if own is stepper and other is not None:
-            in_lanes = lambda *inputs: body(other(), *inputs)
-        return Bodies(keep_roots(functools.partial(body, own)), in_lanes, search_fails)
+            side_by_side = lambda *inputs: body(other(), *inputs)
+        return Bodies(
+            body=keep_roots(functools.partial(body, own)),
+            side_by_side=side_by_side,
+            has_failed=search_fails,
+            if_long=_num_unknowns(begin) > _FEW_IN_LANES,
+        )
 
     kept = Begin(
         kept=keep(stepper.model_at(begin))(begin.state, begin.place),
@@ -383,8 +388,10 @@ def run_loop(
     return kept, eqx.tree_at(lambda x: x.result, end, result), record
 
 
-# The largest number of unknowns of a step that is computed for many lanes side by side.
-_MANY_IN_LANES = 64
+# The largest number of unknowns of a step that is computed for many lanes side by side, and
+# the same if a single run is one function: a chain of 8 points, with 32 unknowns, takes a
+# quarter longer side by side, two hinged bodies, which are no single function, half as long.
+_MANY_IN_LANES, _FEW_IN_LANES = 40, 16
 
 
 def for_lanes(stepper: Stepper, begin: Progress) -> Callable[[], Stepper] | None:
@@ -393,7 +400,6 @@ def for_lanes(stepper: Stepper, begin: Progress) -> Callable[[], Stepper] | None
     Lanes whose steps need it are computed again with it.
     """
     newton, stage, model = stepper.root_finder, stepper.scheme.stage, stepper.model
-    stage_memory = jax.tree.map(lambda x: x[0], begin.warm.stages)
     if (
         not (isinstance(newton, Newton) and newton.linear_solver is None)
         or not (stepper.may_have_lanes and isinstance(stepper.plan, EqualPlan))
@@ -401,7 +407,7 @@ def for_lanes(stepper: Stepper, begin: Progress) -> Callable[[], Stepper] | None
         or not model.has_delassus_matrix
         or stepper.watcher is not None
         or model.system.redundant
-        or num_unknowns(stage_memory) > _MANY_IN_LANES
+        or _num_unknowns(begin) > _MANY_IN_LANES
     ):
         return None
     # The zeros must become known where the steps are traced.
@@ -410,6 +416,10 @@ def for_lanes(stepper: Stepper, begin: Progress) -> Callable[[], Stepper] | None
         model=model.with_known_zeros(begin.state),
         root_finder=ChordAlone(newton, if_small=True),
     )
+
+
+def _num_unknowns(begin: Progress) -> int:
+    return num_unknowns(jax.tree.map(lambda x: x[0], begin.warm.stages))
 
 
 def search_fails(before: Progress, after: Progress) -> Flag:

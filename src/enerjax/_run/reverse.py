@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._programs import in_any_lane, in_one_function
+from .._programs import in_any_lane, in_one_function, SideBySide
 from .._solvers import ROOT
 from .._types import Flag
 
@@ -30,14 +30,16 @@ Body: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]
 
 
 class Bodies(NamedTuple):
-    """The body of a loop, and the one for the lanes of a batch, if there is one.
+    """The body of a loop, and the one for lanes side by side, if there is one.
 
-    `has_failed(before, after)` says whether it has failed in passes between two carries.
+    - `has_failed(before, after)`: whether it has failed in passes between two carries.
+    - `if_long`: see `SideBySide`.
     """
 
     body: Body
-    in_lanes: Body | None
+    side_by_side: Body | None
     has_failed: Callable[[Any, Any], Flag]
+    if_long: bool
 
 
 # `scan(bodies, carry, count, live)` calls `body(carry, live)` `count` times.
@@ -99,17 +101,19 @@ def _in_segments(
         one_pass = lambda carry, k: body(carry, live & (first + k < count))
         return jax.lax.scan(one_pass, carry, jnp.arange(size))
 
-    in_lanes = None
-    if bodies.in_lanes is not None:
-        body = bodies.in_lanes
+    lanes = None
+    if bodies.side_by_side is not None:
+        body = bodies.side_by_side
 
-        def in_lanes(carry: Any, inputs: tuple[Array, Flag]) -> tuple[Any, Flag]:
+        def side_by_side(carry: Any, inputs: tuple[Array, Flag]) -> tuple[Any, Flag]:
             out = passes(body, carry, inputs)
             return out, bodies.has_failed(carry, out[0])
 
+        fewest = max(_FEWEST_LANES, -(-_FEWEST_STEPS // total))
+        lanes = SideBySide(side_by_side, fewest, bodies.if_long)
+
     whole = functools.partial(passes, bodies.body)
-    fewest = max(_FEWEST_LANES, -(-_FEWEST_STEPS // total))
-    segment = in_one_function(keep_roots(whole), in_lanes, fewest)
+    segment = in_one_function(keep_roots(whole), lanes)
     if total > LONG:
         segment = _checkpoint(segment)
     if done is not None:

@@ -18,6 +18,15 @@ from ..compiled import is_hashable
 from ..numpy_primitives import evaluated
 
 
+# The most operations of a program that is evaluated entry by entry, which takes about 20
+# microseconds for each.
+_MOST = 100_000
+
+
+class UnsupportedError(Exception):
+    """A program that is not evaluated entry by entry, because of an operation or its size."""
+
+
 class Region:
     """A program without loops but for those in `loops`, such as the body of a loop.
 
@@ -104,6 +113,8 @@ class Graph:
         if not is_hashable(key):
             return Entry(dtype, region, level, primitive, params, operands)
         if key not in self._found:
+            if len(self._found) >= _MOST:
+                raise UnsupportedError("too many operations")
             self._found[key] = Entry(dtype, region, level, primitive, params, operands)
         return self._found[key]
 

@@ -23,11 +23,16 @@ from ..primitives import (
     PLACES_OF_EXTREMES,
     SCATTERS,
 )
-from .entries import array_of, Entry, Graph, is_same, Number, objects, Region
-
-
-class UnsupportedError(Exception):
-    """A program with an operation that is not evaluated entry by entry."""
+from .entries import (
+    array_of,
+    Entry,
+    Graph,
+    is_same,
+    Number,
+    objects,
+    Region,
+    UnsupportedError,
+)
 
 
 # Loops of at most this length within a step are unrolled; longer ones are not supported.
@@ -167,7 +172,9 @@ class Evaluation:
             return self._moved(primitive, values, params, avals)
         raise UnsupportedError(name)
 
-    def _elementwise(self, primitive: Any, values: list[Any], params: Any, aval: Any) -> Any:
+    def _elementwise(
+        self, primitive: Any, values: list[Any], params: Any, aval: Any
+    ) -> Any:
         columns = [np.broadcast_to(objects(x), aval.shape).ravel() for x in values]
         number = lambda *xs: self.graph.number(primitive, xs, params, aval.dtype)
         return array_of(map(number, *columns), aval.shape, aval.dtype)
@@ -179,7 +186,9 @@ class Evaluation:
         if rows.shape[1] == 0:
             raise UnsupportedError("a reduction of nothing")
         pair = lambda a, b: self.graph.number(primitive, (a, b), {}, aval.dtype)
-        return array_of((functools.reduce(pair, row) for row in rows), aval.shape, aval.dtype)
+        return array_of(
+            (functools.reduce(pair, row) for row in rows), aval.shape, aval.dtype
+        )
 
     def _contracted(self, values: list[Any], numbers: Any, aval: Any) -> np.ndarray:
         contracted, batch = numbers
@@ -219,7 +228,9 @@ class Evaluation:
         rows = np.moveaxis(objects(x), axes[0], -1).reshape(aval.size, -1)
         return array_of(map(place, rows), aval.shape, aval.dtype)
 
-    def _scattered(self, name: str, values: list[Any], params: Any, aval: Any) -> np.ndarray:
+    def _scattered(
+        self, name: str, values: list[Any], params: Any, aval: Any
+    ) -> np.ndarray:
         operand, index, updates = values
         if _is_unknown(index):
             raise UnsupportedError(name)
@@ -484,7 +495,9 @@ def _normal(x: Any) -> np.ndarray:
     x = np.asarray(x)
     if x.dtype != object or any(isinstance(y, Entry) for y in x.ravel()):
         return x
-    return np.array(list(x.ravel()), x.ravel()[0].dtype if x.size else float).reshape(x.shape)
+    return np.array(list(x.ravel()), x.ravel()[0].dtype if x.size else float).reshape(
+        x.shape
+    )
 
 
 def _long_scan(

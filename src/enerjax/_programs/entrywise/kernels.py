@@ -53,7 +53,9 @@ def kernel(
     # Each result takes the place of an input of its type. Where there are more results
     # than inputs of a type, an input is passed several times.
     slots: list[Entry] = list(inputs)
-    free = {kind: [k for k, x in enumerate(slots) if x.dtype == kind] for kind in _kinds(slots)}
+    free = {
+        kind: [k for k, x in enumerate(slots) if x.dtype == kind] for kind in _kinds(slots)
+    }
     places = []
     for entry in wanted:
         own_kind = free.setdefault(entry.dtype, [])
@@ -71,7 +73,9 @@ def kernel(
         values: dict[Entry, Any] = dict(zip(inputs, numbers, strict=False))
         read = lambda x: values[x] if isinstance(x, Entry) else _literal(x)
         for entry in entries:
-            (out,) = evaluate(entry.primitive, list(map(read, entry.operands)), entry.params)
+            (out,) = evaluate(
+                entry.primitive, list(map(read, entry.operands)), entry.params
+            )
             values[entry] = out
         results = list(numbers)
         for place, entry in zip(places, wanted, strict=True):

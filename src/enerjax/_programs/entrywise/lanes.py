@@ -10,8 +10,16 @@ from jax.core import Tracer
 from jaxtyping import Array, PyTree
 
 from .emission import computed, value_of
-from .entries import array_of, Entry, Graph, Number, objects, Region
-from .evaluation import Evaluation, Stack, UnsupportedError
+from .entries import (
+    array_of,
+    Entry,
+    Graph,
+    Number,
+    objects,
+    Region,
+    UnsupportedError,
+)
+from .evaluation import Evaluation, Stack
 from .kernels import has_kernels
 from .planning import plan_of
 

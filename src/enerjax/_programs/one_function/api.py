@@ -2,20 +2,33 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, PyTree
 
 from ..._types import Flag
+
 from .marks import APART, has_marks
+
+
+class SideBySide(NamedTuple):
+    """A program for the lanes of a batch side by side.
+
+    - `fn`: returns the same values as the other program, and whether it has failed.
+    - `fewest`: the number of lanes from which it is used.
+    - `if_long`: whether it is used only if the other program is too long for one function.
+    """
+
+    fn: Callable[..., tuple[PyTree[Array], Flag]]
+    fewest: int
+    if_long: bool
 
 
 def in_one_function(
     fn: Callable[..., PyTree[Array]],
-    in_lanes: Callable[..., tuple[PyTree[Array], Flag]] | None = None,
-    fewest_lanes: int = 1,
+    side_by_side: SideBySide | None = None,
 ) -> Callable[..., PyTree[Array]]:
     """`fn`, between trees of arrays, as one function of machine code where it can be.
 
@@ -24,11 +37,10 @@ def in_one_function(
     values they keep. The lanes of a batch run one after the other, each with the iterations
     that it needs.
 
-    With `in_lanes`, batches of `fewest_lanes` or more run side by side instead: it returns
-    the same values by a shorter program, and whether it has failed. Lanes for which it has
-    failed are computed again by `fn`, and so are derivatives.
+    With `side_by_side` the lanes of large batches run side by side instead. Lanes for which
+    that fails are computed again by `fn`, and so are derivatives.
     """
-    return _called(fn, False, in_lanes, fewest_lanes)
+    return _called(fn, False, side_by_side)
 
 
 def part(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Array]]:
@@ -43,15 +55,14 @@ def part(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Array]]:
 def _called(
     fn: Callable[..., PyTree[Array]],
     is_part: bool,
-    in_lanes: Callable[..., tuple[PyTree[Array], Flag]] | None = None,
-    fewest_lanes: int = 1,
+    side_by_side: SideBySide | None = None,
 ) -> Callable[..., PyTree[Array]]:
     if not has_marks():
         return fn
     # Imported here, because other versions of JAX may define primitives in another way.
     from .lanes import call
 
-    return functools.partial(call, fn, is_part, in_lanes, fewest_lanes)
+    return functools.partial(call, fn, is_part, side_by_side)
 
 
 def unmerged(fn: Callable[..., tuple[Array, ...]]) -> Callable[..., tuple[Array, ...]]:
@@ -73,3 +84,12 @@ def unmerged(fn: Callable[..., tuple[Array, ...]]) -> Callable[..., tuple[Array,
         return first, *others
 
     return apart
+
+
+def run_side_by_side(jaxpr: Any, lanes: int) -> bool:
+    """Whether a part of a program would run side by side in a batch of so many lanes."""
+    if not has_marks():
+        return False
+    from .lanes import run_side_by_side
+
+    return run_side_by_side(jaxpr, lanes)

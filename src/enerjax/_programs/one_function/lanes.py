@@ -10,6 +10,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
+from ..jaxprs import programs_within
 from .program import call as call, merged, ONE_FUNCTION, Program, run_closed, split
 
 if TYPE_CHECKING:
@@ -41,7 +42,19 @@ def _lanes(numbers: Any, axes: Any, *, program: Program) -> tuple[list, list[int
 
 def _is_worth(program: Program, lanes: int) -> bool:
     """Whether lanes run side by side, if that is possible."""
-    return program.in_lanes is not None and lanes >= program.in_lanes.fewest
+    other = program.in_lanes
+    if other is None or (other.if_long and program.is_possible):
+        return False
+    return lanes >= other.fewest
+
+
+def run_side_by_side(jaxpr: Any, lanes: int) -> bool:
+    """Whether a part of a program would run side by side in a batch, if that is possible."""
+    return any(
+        (eqn.primitive is ONE_FUNCTION and _is_worth(eqn.params["program"], lanes))
+        or any(run_side_by_side(inner, lanes) for inner in programs_within(eqn))
+        for eqn in jaxpr.eqns
+    )
 
 
 def _in_turn(

@@ -13,7 +13,6 @@ from jax.interpreters import ad, mlir
 from jax.interpreters.partial_eval import dce_jaxpr_consts
 from jaxtyping import Array, PyTree
 
-from ..._types import Flag
 from ..counting import num_equations
 from .marks import marked
 from .possible import has_parts, is_possible, longest, NAME
@@ -23,16 +22,15 @@ from .rewriting import as_index, REWRITTEN, rewritten
 def call(
     fn: Callable[..., PyTree[Array]],
     is_part: bool,
-    in_lanes: Callable[..., tuple[PyTree[Array], Flag]] | None,
-    fewest_lanes: int,
+    side_by_side: Any,
     *args: PyTree[Array],
 ) -> PyTree[Array]:
-    """`fn(*args)` in one function, if it can be; for `in_lanes` see `in_one_function`."""
+    """`fn(*args)` in one function, if it can be; see `in_one_function`."""
     closed, like = jax.make_jaxpr(fn, return_shape=True)(*args)
     wanted = [True] * len(closed.out_avals)
     lanes = None
-    if in_lanes is not None:
-        lanes = jax.make_jaxpr(in_lanes)(*args), fewest_lanes
+    if side_by_side is not None:
+        lanes = jax.make_jaxpr(side_by_side.fn)(*args), side_by_side
     out = run_closed(closed, jax.tree.leaves(args), wanted, is_part, in_lanes=lanes)
     return jax.tree.unflatten(jax.tree.structure(like), map(jnp.asarray, out))
 
@@ -107,7 +105,7 @@ class InLanes:
     - `jaxpr`: its outputs are those of the other program, and whether it has failed. Its
       constants are passed as the first inputs.
     - `known`: the values of the inputs that are known; `None` for those that are passed.
-    - `fewest`: the number of lanes from which the program is used.
+    - `fewest`, `if_long`: when it is used; see `SideBySide`.
     """
 
     def __init__(
@@ -115,9 +113,9 @@ class InLanes:
         closed: ClosedJaxpr,
         numbers: Sequence[Any],
         wanted: Sequence[bool],
-        fewest: int,
+        when: Any,
     ):
-        self.fewest = fewest
+        self.fewest, self.if_long = when.fewest, when.if_long
         self.jaxpr, of_consts, of_inputs = dce_jaxpr_consts(closed.jaxpr, [*wanted, True])
         needed, _ = split([*of_consts, *of_inputs], [*closed.consts, *numbers])
         self.known = [None if isinstance(x, Tracer) else np.asarray(x) for x in needed]
@@ -143,7 +141,7 @@ def run_closed(
     wanted: Sequence[bool],
     is_part: bool,
     linear: int = 0,
-    in_lanes: tuple[ClosedJaxpr, int] | None = None,
+    in_lanes: tuple[ClosedJaxpr, Any] | None = None,
 ) -> list[Any]:
     """The wanted outputs of a program, in one function where that is possible.
 
@@ -159,8 +157,8 @@ def run_closed(
     linear = sum(of_inputs[len(of_inputs) - linear :])
     lanes, more = None, []
     if in_lanes is not None:
-        other, fewest = in_lanes
-        lanes = InLanes(other, inputs, computed, fewest)
+        other, when = in_lanes
+        lanes = InLanes(other, inputs, computed, when)
         # They are passed on, and not kept: a program can outlive the trace of its inputs.
         more, lanes.numbers = lanes.numbers, []
     program = Program(jaxpr, list(map(as_index, needed)), is_part, linear, lanes)

@@ -86,7 +86,7 @@ def sweep(
     own = range(jax.process_index(), count, jax.process_count())
     lanes = [min(chunks.shape[1], order.size - k * chunks.shape[1]) for k in own]
     report = _reporter(progress, sum(lanes))
-    run, done = Chunk(lane, chunks.shape[1], batch_size), {}
+    run, done = Chunk(lane, traced, chunks.shape[1], batch_size), {}
     for number in own:
         leaves = store.read(number) if store else None
         if leaves is None:
