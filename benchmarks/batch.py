@@ -3,15 +3,16 @@
     python benchmarks/batch.py [--out FOLDER] [--quick] [--only WORK]
 
 Four works: double pendulums, heavy tops, two hinged bodies in space, and car axes with a
-driven mount. A parameter and the length of the step differ in each lane. `EnergyPreserving()`
-runs as a `vmap` over all lanes, and alone; diffrax (the extra `peers`; Tsit5 with the same
-fixed steps, on the same model with the constraints differentiated twice) as a `vmap`, and as
-a `lax.map` over chunks of lanes, of which the fastest counts. Forward runs and their
-gradients by the parameter. A lane is compared with its run alone, the energy with its
-balance, and the end with that of diffrax; a wrong answer is reported and not timed. Times
-are medians over interleaved repeats on one core with XLA's default settings, or on the GPU
-that JAX finds. At last a sweep of double pendulums runs on one and on two host devices, by
-the wall clock and on all cores of the machine. Writes batch.json and batch.png.
+driven mount. A parameter and the length of the step differ in each lane. Ours,
+`EnergyPreserving()`, runs as a `vmap` over all lanes, and alone; diffrax (the extra
+`peers`; Tsit5 with the same fixed steps, on the same model with the constraints
+differentiated twice) as a `vmap`, and as a `lax.map` over chunks of lanes, of which the
+fastest counts. Forward runs and their gradients by the parameter. A lane is compared with
+its run alone, the energy with its balance, and the end with that of diffrax; a wrong answer
+is reported and not timed. Times are medians over interleaved repeats on one core with XLA's
+default settings, or on the GPU that JAX finds. At last a sweep of double pendulums runs on
+one and on two host devices, by the wall clock and on all cores of the machine.
+Writes batch.json and batch.png.
 """
 
 import json
@@ -241,7 +242,7 @@ def of_work(name: str, work: Work, quick: bool) -> list[harness.Row]:
     return rows
 
 
-# All cores ----------------------------------------------------------------------------------
+# All cores ------------------------------------------------------------------------------
 
 
 def seconds_of_a_sweep() -> float:
@@ -294,7 +295,8 @@ def show(rows: list[harness.Row]) -> None:
                 ratios += f" {time_of(row) / min(others, default=np.nan):5.2f} {code}"
         print(
             f"{row['work']:16s} {row['kind']:8s} {row['code']:8s} chunk {row['chunk']:5d} "
-            f"{time_of(row):9.1f} ns/lane-step{ratios:28s} compile {row['compile_s']:5.1f} s"
+            f"{time_of(row):9.1f} ns/lane-step{ratios:28s} "
+            f"compile {row['compile_s']:5.1f} s"
             + "".join(
                 f"  {key} {row[key]:.2g}"
                 for key in ("lane_difference", "energy", "error", "corrections")

@@ -39,7 +39,7 @@ def are_side_by_side(fn, *args):
     return "enerjax_in_lanes" in names(jax.make_jaxpr(fn)(*args).jaxpr)
 
 
-# Programs entry by entry -------------------------------------------------------------------
+# Programs entry by entry ----------------------------------------------------------------
 
 
 def arithmetic(x, y):
@@ -104,7 +104,7 @@ def test_zeros_that_are_known():
     seen(jnp.ones(2))
 
 
-# Runs --------------------------------------------------------------------------------------
+# Runs -----------------------------------------------------------------------------------
 
 STEPS = 24
 

@@ -21,8 +21,8 @@ from .event_search import Found, no_search, settle, Watch
 from .halving import select
 from .reverse import Bodies, keep_roots, loops
 from .saving import Begin, Costs, Record, with_time
-from .step import advance, first_warm, model_for, StepOutput, Warm
 from .stage import num_unknowns
+from .step import advance, first_warm, model_for, StepOutput, Warm
 from .step_sizes import AbstractPlan, EqualPlan, Verdict
 from .watcher import Happening, Watcher
 
@@ -388,9 +388,10 @@ def run_loop(
     return kept, eqx.tree_at(lambda x: x.result, end, result), record
 
 
-# The largest number of unknowns of a step that is computed for many lanes side by side, and
-# the same if a single run is one function: a chain of 8 points, with 32 unknowns, takes a
-# quarter longer side by side, two hinged bodies, which are no single function, half as long.
+# The largest number of unknowns of a step that is computed for many lanes side by side,
+# and the same if a single run is one function. A chain of 8 points, with 32 unknowns, takes
+# a quarter longer side by side; two hinged bodies, which are too long for one function,
+# take two thirds of the time.
 _MANY_IN_LANES, _FEW_IN_LANES = 40, 16
 
 

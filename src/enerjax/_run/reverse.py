@@ -22,8 +22,8 @@ from .._types import Flag
 
 # With more steps than this the roots are not kept.
 LONG = 10_000
-# The fewest lanes of a batch, and steps of all its lanes together, for which the program for
-# lanes side by side is made: it takes seconds to compile.
+# The fewest lanes of a batch, and steps of all its lanes together, for which the program
+# for lanes side by side is made: it takes seconds to compile.
 _FEWEST_LANES, _FEWEST_STEPS = 64, 20_000
 
 Body: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]

@@ -1,7 +1,7 @@
 """Programs of small systems for many lanes, entry by entry.
 
-Every number of a lane is a vector over the lanes, so that operations on structural zeros and
-known numbers are left out, and loops over lanes use all entries of a vector register.
+Every number of a lane is a vector over the lanes. Operations on structural zeros and known
+numbers are left out, and loops over lanes use all entries of a vector register.
 """
 
 from .lanes import (

@@ -24,7 +24,7 @@ _MOST = 100_000
 
 
 class UnsupportedError(Exception):
-    """A program that is not evaluated entry by entry, because of an operation or its size."""
+    """A program that is not evaluated entry by entry: for an operation, or its size."""
 
 
 class Region:
@@ -128,7 +128,7 @@ def _identity(x: Number) -> Any:
     return (x.tobytes(), x.dtype) if isinstance(x, np.generic) else id(x)
 
 
-# Simpler forms -----------------------------------------------------------------------------
+# Simpler forms --------------------------------------------------------------------------
 
 
 def _is(x: Number, value: float) -> bool:
@@ -173,7 +173,7 @@ def _neg(graph, operands, params, dtype):
 
 def _and(graph, operands, params, dtype):
     a, b = operands
-    if dtype != bool:
+    if dtype.kind != "b":
         return None
     if _is(a, False) or _is(b, False):
         return np.False_
@@ -182,7 +182,7 @@ def _and(graph, operands, params, dtype):
 
 def _or(graph, operands, params, dtype):
     a, b = operands
-    if dtype != bool:
+    if dtype.kind != "b":
         return None
     if _is(a, True) or _is(b, True):
         return np.True_
@@ -239,7 +239,7 @@ _SIMPLER: dict[str, Callable[[Graph, Any, dict[str, Any], Any], Number | None]] 
 }
 
 
-# Arrays of numbers -------------------------------------------------------------------------
+# Arrays of numbers ----------------------------------------------------------------------
 
 
 def objects(x: Any) -> np.ndarray:

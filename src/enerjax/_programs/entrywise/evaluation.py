@@ -338,7 +338,7 @@ def _updated(x: Any, update: Any, *starts: Any, aval: Any) -> np.ndarray:
     return array_of(x.ravel(), aval.shape, aval.dtype)
 
 
-# Loops and branches ------------------------------------------------------------------------
+# Loops and branches ---------------------------------------------------------------------
 
 
 def _cond(self: Evaluation, values: list[Any], params: dict[str, Any]) -> list[Any]:

@@ -10,6 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from ..fast_loops import are_enabled
 from ..jaxprs import evaluate
 from ..one_function.marks import has_marks
 from .entries import Entry, Number
@@ -17,8 +18,11 @@ from .entries import Entry, Number
 
 @functools.cache
 def has_kernels() -> bool:
-    """Whether XLA evaluates a window of one entry by its function, as `kernel` needs."""
-    if not has_marks():
+    """Whether XLA evaluates a window of one entry by its function, as `kernel` needs.
+
+    Within one function its loop would not be vectorised.
+    """
+    if not has_marks() or are_enabled():
         return False
     fn = lambda x, y: (x + y, x * y + 2)
     like = jax.ShapeDtypeStruct((8,), np.float32)

@@ -108,8 +108,9 @@ def known_zeros(fn: Callable[[], PyTree[Array]]) -> PyTree[np.ndarray]:
     is_zero = lambda x: isinstance(x, np.generic) and x == 0
     masks = (np.zeros(x.shape, bool) for x in outputs)
     if found is not None:
-        flat = (map(is_zero, objects(x).ravel()) for x in outputs)
-        masks = (np.array(list(x), bool).reshape(y.shape) for x, y in zip(flat, outputs))
+        flat = (list(map(is_zero, objects(x).ravel())) for x in outputs)
+        shapes = (x.shape for x in outputs)
+        masks = map(np.reshape, (np.array(x, bool) for x in flat), shapes)
     return jax.tree.unflatten(jax.tree.structure(like), list(masks))
 
 

@@ -1,8 +1,8 @@
-"""Which numbers are passed from one loop over lanes to another, and which are computed again.
+"""Which numbers are passed from one loop over lanes to the next, and which are repeated.
 
 A number that a loop over lanes reads costs more than an addition: it is read, and because
-XLA's operation has as many results as inputs, it is written too. What a loop reads, and what
-it computes from that, is therefore chosen by a minimum cut in the graph of the operations.
+XLA's operation has as many results as inputs, it is written too. What a loop reads, and
+what it computes from that, is therefore a minimum cut in the graph of the operations.
 """
 
 from collections.abc import Iterable
@@ -37,7 +37,7 @@ class Kernel(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """How the numbers of a region are computed: a kernel before each loop and after the last.
+    """The kernels of a region, one before each loop and one after the last.
 
     - `loops`: the loops, with the plans of their bodies.
     - `inputs`: the entries from outside of the region, and its own inputs, that are read.
@@ -62,11 +62,12 @@ def plan_of(region: Region, numbers: Iterable[Number]) -> Plan:
             needed = dict.fromkeys(x for x in needed if x not in loop.after)
             needed |= dict.fromkeys(x for x in body.inputs if x not in own)
             needed |= dict.fromkeys(x for x in loop.inputs if isinstance(x, Entry))
-        is_here = lambda x: x.region is region and x.level == level and x.primitive
-        wanted = [x for x in needed if is_here(x)]
+        wanted = [x for x in needed if _is_new(x, region, level)]
         entries, inputs = _cut(region, level, wanted)
         kernels.append(Kernel(entries, wanted))
-        needed = dict.fromkeys(x for x in needed if not is_here(x)) | dict.fromkeys(inputs)
+        here = set(wanted)
+        needed = dict.fromkeys(x for x in needed if x not in here)
+        needed |= dict.fromkeys(inputs)
     return Plan(kernels[::-1], loops[::-1], list(needed))
 
 
@@ -87,7 +88,7 @@ def _cut(
     source, sink = 2 * len(order), 2 * len(order) + 1
     edges: list[tuple[int, int, int]] = []
     for entry, k in number.items():
-        is_new = entry.region is region and entry.level == level and entry.primitive
+        is_new = _is_new(entry, region, level)
         edges.append((2 * k, 2 * k + 1, _NEVER if is_new else _INPUT))
         edges.append((2 * k + 1, sink, _cost(entry)))
         for x in entry.operands:
@@ -98,6 +99,12 @@ def _cut(
     entries = [x for x, k in number.items() if 2 * k + 1 in reached]
     inputs = [x for x, k in number.items() if 2 * k in reached and 2 * k + 1 not in reached]
     return entries, inputs
+
+
+def _is_new(entry: Entry, region: Region, level: int) -> bool:
+    """Whether an entry cannot be computed before a kernel."""
+    is_input = entry.primitive is None
+    return not is_input and entry.region is region and entry.level == level
 
 
 def _cost(entry: Entry) -> int:

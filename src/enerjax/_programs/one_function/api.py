@@ -9,7 +9,6 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, PyTree
 
 from ..._types import Flag
-
 from .marks import APART, has_marks
 
 

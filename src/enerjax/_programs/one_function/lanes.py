@@ -13,15 +13,16 @@ from jaxtyping import Array
 from ..jaxprs import programs_within
 from .program import call as call, merged, ONE_FUNCTION, Program, run_closed, split
 
+
 if TYPE_CHECKING:
     from ..entrywise import ProgramInLanes
 
 
 # The most lanes side by side: the numbers of more would not fit into the cache.
 _WIDEST = 104
-# Lanes side by side are a multiple of this number, the width of vector registers.
-_ROUND = 8
-_ALIASED = 64
+# Lanes side by side are a multiple of the first number, the width of vector registers, and
+# none of the second: vectors at such distances share few places of the cache.
+_ROUND, _ALIASED = 8, 64
 
 
 def _lanes(numbers: Any, axes: Any, *, program: Program) -> tuple[list, list[int]]:
@@ -49,7 +50,7 @@ def _is_worth(program: Program, lanes: int) -> bool:
 
 
 def run_side_by_side(jaxpr: Any, lanes: int) -> bool:
-    """Whether a part of a program would run side by side in a batch, if that is possible."""
+    """Whether a part of a program is to run side by side in a batch, if possible."""
     return any(
         (eqn.primitive is ONE_FUNCTION and _is_worth(eqn.params["program"], lanes))
         or any(run_side_by_side(inner, lanes) for inner in programs_within(eqn))
@@ -87,14 +88,14 @@ def _is_sharded(x: Array) -> bool:
 batching.primitive_batchers[ONE_FUNCTION] = _lanes
 
 
-# Lanes side by side ------------------------------------------------------------------------
+# Lanes side by side ---------------------------------------------------------------------
 
 IN_LANES = Primitive("enerjax_in_lanes")
 IN_LANES.multiple_results = True
 
 
 def _side_by_side(program: Program) -> "ProgramInLanes | None":
-    """The program for lanes, if there is one and it has only operations that are possible."""
+    """The program for lanes, if there is one and it is possible."""
     if program.in_lanes is None:
         return None
     return program.in_lanes.function
@@ -114,7 +115,6 @@ def _in_chunks(
     own, shared = split(is_own, needed)
     chunks = -(-lanes // _WIDEST)
     width = -(-lanes // (chunks * _ROUND)) * _ROUND
-    # Vectors whose length is a power of two share few places of the cache.
     width += _ROUND if width % _ALIASED == 0 else 0
     chosen = np.minimum(np.arange(chunks * width), lanes - 1)
 

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,10 @@ from ..counting import num_equations
 from .marks import marked
 from .possible import has_parts, is_possible, longest, NAME
 from .rewriting import as_index, REWRITTEN, rewritten
+
+
+if TYPE_CHECKING:
+    from ..entrywise import ProgramInLanes
 
 
 def call(
