@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from .._operators import AbstractModel
+from .._operators import AbstractModel, SeparableModel
 from .._programs import in_any_lane
 from .._results import first_failure, may_need_newton, RESULTS
 from .._solvers import ChordAlone, Newton, RootFinder
@@ -364,7 +364,8 @@ def run_loop(
     def bodies(own: Stepper, body: Callable) -> Bodies:
         side_by_side = None
         if own is stepper and other is not None:
-            side_by_side = lambda *inputs: body(other(), *inputs)
+            make = other
+            side_by_side = lambda *inputs: body(make(), *inputs)
         return Bodies(
             body=keep_roots(functools.partial(body, own)),
             side_by_side=side_by_side,
@@ -405,7 +406,7 @@ def for_lanes(stepper: Stepper, begin: Progress) -> Callable[[], Stepper] | None
         not (isinstance(newton, Newton) and newton.linear_solver is None)
         or not (stepper.may_have_lanes and isinstance(stepper.plan, EqualPlan))
         or not isinstance(stage, AbstractSchemeWithChord)
-        or not model.has_delassus_matrix
+        or not (isinstance(model, SeparableModel) and model.has_delassus_matrix)
         or stepper.watcher is not None
         or model.system.redundant
         or _num_unknowns(begin) > _MANY_IN_LANES

@@ -66,6 +66,11 @@ class Entry:
 Number: TypeAlias = Entry | np.generic
 
 
+def scalar(value: Any, dtype: Any) -> np.generic:
+    """A known number."""
+    return np.asarray(value).astype(dtype).reshape(1)[0]
+
+
 class Graph:
     """Creates entries; equal operations on equal operands are one entry."""
 
@@ -79,7 +84,7 @@ class Graph:
         if all(isinstance(x, np.generic) for x in operands):
             with jax.ensure_compile_time_eval():
                 (value,) = evaluated(primitive, list(operands), params)
-            return np.asarray(value).astype(dtype)[()]
+            return scalar(value, dtype)
         simplify = _SIMPLER.get(primitive.name)
         if simplify is not None:
             simple = simplify(self, operands, params, np.dtype(dtype))

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 
 from ..jaxprs import interpret, wrapped_program
 from ..numpy_primitives import evaluated, moved
@@ -31,6 +32,7 @@ from .entries import (
     Number,
     objects,
     Region,
+    scalar,
     UnsupportedError,
 )
 
@@ -255,7 +257,7 @@ class Evaluation:
         part = lambda k: np.take(x, range(k, k + sizes[axis]), axis).ravel()
         out = list(part(0))
         for k in range(1, rooms[axis]):
-            least = np.asarray(k, start.dtype)[()]
+            least = scalar(k, start.dtype)
             beyond = self.graph.number(lax.ge_p, (start, least), {}, np.bool_)
             choose = lambda old, new, beyond=beyond: self.graph.chosen(beyond, old, new)
             out = list(map(choose, out, part(k)))
@@ -307,7 +309,7 @@ class Evaluation:
 
 def _plain(x: Any) -> Any:
     """A constant of a program; constants that are traced are inputs of the program."""
-    if isinstance(x, jax.core.Tracer):
+    if isinstance(x, Tracer):
         raise UnsupportedError("a traced constant")
     return np.asarray(x)
 
@@ -354,7 +356,7 @@ def _cond(self: Evaluation, values: list[Any], params: dict[str, Any]) -> list[A
     if len(self.region.loops) > loops:
         raise UnsupportedError("a loop in a branch")
     graph = self.graph
-    zero = np.zeros((), which.dtype)[()]
+    zero = scalar(0, which.dtype)
     on = graph.number(lax.ne_p, (which, zero), {}, np.bool_)
     return [
         array_of(
@@ -465,8 +467,8 @@ def _scan(self: Evaluation, values: list[Any], params: dict[str, Any]) -> list[A
     stacked = []
     order = range(length)[:: -1 if params["reverse"] else 1]
     for k in order:
-        own = [np.asarray(x)[k] for x in map(_keep_shape, rows)]
-        out = self._closed(closed, [*consts, *carry, *map(_normal, own)])
+        own = [_row_of(x, k) for x in rows]
+        out = self._closed(closed, [*consts, *carry, *own])
         carry = out[:count]
         stacked.append(out[count:])
     stacked = stacked[:: -1 if params["reverse"] else 1]
@@ -482,22 +484,13 @@ def _scan(self: Evaluation, values: list[Any], params: dict[str, Any]) -> list[A
     return [*carry, *joined]
 
 
-def _keep_shape(x: Any) -> np.ndarray:
-    return np.asarray(x)
-
-
-def _normal(x: Any) -> np.ndarray:
-    """An entry of an array of numbers as an array."""
-    if isinstance(x, Entry):
-        out = np.empty((), object)
-        out[()] = x
-        return out
+def _row_of(x: Any, k: int) -> np.ndarray:
+    """Row `k` of an array of numbers."""
     x = np.asarray(x)
-    if x.dtype != object or any(isinstance(y, Entry) for y in x.ravel()):
-        return x
-    return np.array(list(x.ravel()), x.ravel()[0].dtype if x.size else float).reshape(
-        x.shape
-    )
+    if x.dtype != object:
+        return np.asarray(x[k])
+    numbers = x[k : k + 1].ravel()
+    return array_of(numbers, x.shape[1:], numbers[0].dtype) if numbers.size else x[k]
 
 
 def _long_scan(

@@ -13,7 +13,7 @@ from jaxtyping import Array
 from ..fast_loops import are_enabled
 from ..jaxprs import evaluate
 from ..one_function.marks import has_marks
-from .entries import Entry, Number
+from .entries import Entry
 
 
 @functools.cache
@@ -98,6 +98,6 @@ def _literal(x: np.generic) -> Array:
     return jnp.asarray(x, x.dtype)
 
 
-def filled(number: Number, size: int) -> Array:
+def filled(number: np.generic, size: int) -> Array:
     """A known number for each of `size` lanes."""
-    return jnp.full((size,), number, number.dtype)
+    return jnp.full((size,), jnp.asarray(number), number.dtype)

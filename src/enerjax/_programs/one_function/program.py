@@ -94,7 +94,7 @@ class Program:
         inputs = [*map(jnp.asarray, self._consts), *taken]
         return marked(functools.partial(_values, self._executed), inputs)
 
-    def own(self, numbers: Sequence[Any]) -> Sequence[Any]:
+    def own(self, numbers: Any) -> Any:
         """The inputs of the program itself, of all inputs of the primitive."""
         return numbers[: len(self.known)]
 
