@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .entries import Entry, Number
-from .evaluation import Scan, While
 from .kernels import filled, kernel
+from .loops import Scan, While
 from .planning import Kernel, Plan
 
 

@@ -19,8 +19,9 @@ from .entries import (
     Region,
     UnsupportedError,
 )
-from .evaluation import Evaluation, Stack
+from .evaluation import Evaluation
 from .kernels import has_kernels
+from .loops import Stack
 from .planning import plan_of
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 
 from .entries import Entry, Number, Region
-from .evaluation import Scan, While
+from .loops import Scan, While
 
 
 # The cost of an input, and of some operations, in units of an addition.
