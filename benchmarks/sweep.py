@@ -4,10 +4,10 @@
 
 Twice: the double pendulums of `batch.py` (`EnergyPreserving()`, two masses and the step of
 each lane), and `EnergyConsistent(alpha)` over a grid of alpha, h and a mass. Each runs with
-`ej.sweep`, and as `batch.py` runs it: a `lax.map` over chunks of 16 lanes, one program for
-all, compiled before it is timed. The results must agree. Of a sweep the time counts from
-its second chunk on, since the first one compiles; its programs are counted. Writes
-sweep.json and sweep.png.
+`ej.sweep`, whose lanes run side by side, and as a `lax.map` over batches of 16 lanes, which
+run one after the other: one program for all, compiled before it is timed. The results must
+agree. Of a sweep the time counts from its second chunk on, since the first one compiles;
+its programs are counted. Writes sweep.json and sweep.png.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ import enerjax as ej
 
 # Largest difference of positions between the two, which are compiled differently.
 BOUND = 1e-10
-STEPS, CHUNK = 50, 250
+STEPS, CHUNK = 50, 1000
 
 
 def consistent() -> Callable:

@@ -339,39 +339,25 @@ def run_loop(
     )
 
     def one_step(stepper: Stepper, progress: Progress, live: Flag):
-        return stepper.attempt(progress, live & ~is_done(progress))
+        attempt = lambda progress, live: stepper.attempt(
+            progress, live & ~is_done(progress)
+        )
+        return keep_roots(attempt)(progress, live)
 
     def one_group(stepper: Stepper, before: Progress, live: Flag):
         steps = bodies(stepper, one_step)
         after, attempts = over_steps(steps, before, steps_in_group, live)
-        numbers = jnp.arange(steps_in_group)
-        last = jnp.max(jnp.where(attempts.accepted, numbers, 0))
-        return after, Record(
-            kept=keep(stepper.model_at(after))(after.state, after.place),
-            multipliers=after.multipliers,
-            details=jax.tree.map(lambda x: x[last], attempts.details),
-            energies=jax.tree.map(jnp.sum, attempts.energies),
-            costs=attempts.costs.total(),
-            place=after.place,
-            reached=jnp.any(attempts.accepted) & (after.result == RESULTS.successful),
-            happening=jax.tree.map(lambda x: x[last], attempts.happening),
-            varying=after.varying,
-        )
+        kept = keep(stepper.model_at(after))(after.state, after.place)
+        return after, _record_of(after, attempts, kept)
 
     begin = stepper.begin(start)
     other = for_lanes(stepper, begin)
 
     def bodies(own: Stepper, body: Callable) -> Bodies:
-        side_by_side = None
-        if own is stepper and other is not None:
-            make = other
-            side_by_side = lambda *inputs: body(make(), *inputs)
-        return Bodies(
-            body=keep_roots(functools.partial(body, own)),
-            side_by_side=side_by_side,
-            has_failed=search_fails,
-            if_long=_num_unknowns(begin) > _FEW_IN_LANES,
-        )
+        make = other if own is stepper else None
+        side_by_side = None if make is None else lambda *inputs: body(make(), *inputs)
+        is_long = _num_unknowns(begin) > _FEW_IN_LANES
+        return Bodies(functools.partial(body, own), side_by_side, search_fails, is_long)
 
     kept = Begin(
         kept=keep(stepper.model_at(begin))(begin.state, begin.place),
@@ -387,6 +373,23 @@ def run_loop(
     arrived = RESULTS.where(is_whole_run, RESULTS.successful, RESULTS.out_of_steps)
     result = first_failure(end.result, arrived)
     return kept, eqx.tree_at(lambda x: x.result, end, result), record
+
+
+def _record_of(after: Progress, attempts: Attempt, kept: PyTree[Any]) -> Record:
+    """The record of a group of attempted steps."""
+    numbers = jnp.arange(attempts.accepted.size)
+    last = jnp.max(jnp.where(attempts.accepted, numbers, 0))
+    return Record(
+        kept=kept,
+        multipliers=after.multipliers,
+        details=jax.tree.map(lambda x: x[last], attempts.details),
+        energies=jax.tree.map(jnp.sum, attempts.energies),
+        costs=attempts.costs.total(),
+        place=after.place,
+        reached=jnp.any(attempts.accepted) & (after.result == RESULTS.successful),
+        happening=jax.tree.map(lambda x: x[last], attempts.happening),
+        varying=after.varying,
+    )
 
 
 # The largest number of unknowns of a step that is computed for many lanes side by side,

@@ -6,12 +6,21 @@ from typing import Any, TYPE_CHECKING
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
 from ..jaxprs import programs_within
-from .program import call as call, merged, ONE_FUNCTION, Program, run_closed, split
+from .program import (
+    call as call,
+    has_rate,
+    merged,
+    new_primitive,
+    no_rate,
+    ONE_FUNCTION,
+    Program,
+    run_closed,
+    set_rule_for_batches,
+    split,
+)
 
 
 if TYPE_CHECKING:
@@ -85,13 +94,10 @@ def _is_sharded(x: Array) -> bool:
     return any(axis is not None for axis in jax.typeof(x).sharding.spec)
 
 
-batching.primitive_batchers[ONE_FUNCTION] = _lanes
+set_rule_for_batches(ONE_FUNCTION, _lanes)
 
 
 # Lanes side by side ---------------------------------------------------------------------
-
-IN_LANES = Primitive("enerjax_in_lanes")
-IN_LANES.multiple_results = True
 
 
 def _side_by_side(program: Program) -> "ProgramInLanes | None":
@@ -163,12 +169,10 @@ def _with_failed_again(
     return jax.lax.cond(jnp.any(failed), again, lambda: out)
 
 
-@IN_LANES.def_impl
 def _evaluated(*numbers: Array, **params: Any) -> list[Array]:
     return jax.jit(lambda *numbers: _with_failed_again(*numbers, **params))(*numbers)
 
 
-@IN_LANES.def_abstract_eval
 def _shapes(*numbers: Any, program: Program, batched: Sequence[bool]) -> list[Any]:
     (lanes, *_), *_ = (x.shape for x, on in zip(numbers, batched, strict=True) if on)
     return [x.aval.update(shape=(lanes, *x.aval.shape)) for x in program.jaxpr.outvars]
@@ -180,15 +184,14 @@ def _jvp(
     """Derivatives are those of lanes that run one after the other."""
     batched = program.own(batched)
     primals, tangents = program.own(primals), program.own(tangents)
-    has_tangent = [not isinstance(t, ad.Zero) for t in tangents]
+    has_tangent = list(map(has_rate, tangents))
     moved, still = split(has_tangent, primals)
     rates, _ = split(has_tangent, tangents)
     run = lambda *moved: _in_turn(program, merged(has_tangent, moved, still), batched)
     out, rates = jax.jvp(run, tuple(moved), tuple(rates))
-    zero = lambda x: ad.Zero(jax.typeof(x).to_tangent_aval())
     is_smooth = lambda x: jnp.issubdtype(x.dtype, jnp.inexact)
     pairs = zip(out, rates, strict=True)
-    return out, [t if is_smooth(x) else zero(x) for x, t in pairs]
+    return out, [t if is_smooth(x) else no_rate(x) for x, t in pairs]
 
 
 def _more_lanes(
@@ -217,6 +220,5 @@ def _more_lanes(
     return out, [0] * len(out)
 
 
-ad.primitive_jvps[IN_LANES] = _jvp
-batching.primitive_batchers[IN_LANES] = _more_lanes
-mlir.register_lowering(IN_LANES, mlir.lower_fun(_with_failed_again))
+IN_LANES = new_primitive("enerjax_in_lanes", _evaluated, _shapes, _jvp, _with_failed_again)
+set_rule_for_batches(IN_LANES, _more_lanes)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, Primitive
-from jax.interpreters import ad, mlir
+from jax.interpreters import ad, batching, mlir
 from jax.interpreters.partial_eval import dce_jaxpr_consts
 from jaxtyping import Array, PyTree
 
@@ -177,11 +177,40 @@ def run_closed(
     return merged(computed, out, [inputs_by_id[id(x)] if on else None for x, on in pairs])
 
 
-ONE_FUNCTION = Primitive(NAME)
-ONE_FUNCTION.multiple_results = True
+def new_primitive(
+    name: str,
+    evaluated: Callable[..., list[Array]],
+    shapes: Callable[..., list[Any]],
+    jvp: Callable[..., tuple[list, list]],
+    lowered: Callable[..., list[Array]],
+) -> Primitive:
+    """A primitive with several results, and the rules by which JAX treats it."""
+    primitive = Primitive(name)
+    primitive.multiple_results = True
+    primitive.def_impl(evaluated)
+    primitive.def_abstract_eval(shapes)
+    ad.primitive_jvps[primitive] = jvp
+    mlir.register_lowering(primitive, mlir.lower_fun(lowered))
+    return primitive
 
 
-@ONE_FUNCTION.def_impl
+def has_rate(tangent: Any) -> bool:
+    """Whether the rate of an input is not zero by its structure."""
+    return not isinstance(tangent, ad.Zero)
+
+
+def no_rate(x: Any) -> Any:
+    """The rate of a value that does not change."""
+    return ad.Zero(jax.typeof(x).to_tangent_aval())
+
+
+def set_rule_for_batches(
+    primitive: Primitive, rule: Callable[..., tuple[list, list[int]]]
+) -> None:
+    """`rule(numbers, axes, **params)` computes the primitive for all lanes of a batch."""
+    batching.primitive_batchers[primitive] = rule
+
+
 def _evaluated(*numbers: Array, program: Program) -> list[Array]:
     # With `jax_disable_jit`, as in the search for NaNs, another `jit` would come back here.
     is_apart = jax.config.jax_disable_jit  # pyright: ignore[reportAttributeAccessIssue]
@@ -189,7 +218,6 @@ def _evaluated(*numbers: Array, program: Program) -> list[Array]:
     return program(numbers) if is_apart else program.compiled(*numbers)
 
 
-@ONE_FUNCTION.def_abstract_eval
 def _shapes(*_: Any, program: Program) -> list[Any]:
     return [x.aval for x in program.jaxpr.outvars]
 
@@ -197,7 +225,7 @@ def _shapes(*_: Any, program: Program) -> list[Any]:
 def _jvp(primals: Any, tangents: Any, *, program: Program) -> tuple[list, list]:
     """Values in one function, with the residuals of the linearisation; rates in another."""
     primals, tangents = program.own(primals), program.own(tangents)
-    has_tangent = [not isinstance(t, ad.Zero) for t in tangents]
+    has_tangent = list(map(has_rate, tangents))
     moved, _ = split(has_tangent, tangents)
     smooth = [jnp.issubdtype(x.aval.dtype, jnp.inexact) for x in program.jaxpr.outvars]
 
@@ -219,7 +247,7 @@ def _jvp(primals: Any, tangents: Any, *, program: Program) -> tuple[list, list]:
     rates = run_closed(pushed, [*kept, *moved], depends, program.is_part, len(moved))
     out = merged(smooth, out[:num_values], out[num_values + num_kept :])
     rates = merged(smooth, rates, [None] * num_others)
-    zeros = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in out]
+    zeros = list(map(no_rate, out))
     return out, [z if x is None else x for x, z in zip(rates, zeros, strict=True)]
 
 
@@ -256,9 +284,8 @@ def _lowered(*numbers: Array, program: Program) -> list[Array]:
     return program.run(program.own(numbers))
 
 
-ad.primitive_jvps[ONE_FUNCTION] = _jvp
+ONE_FUNCTION = new_primitive(NAME, _evaluated, _shapes, _jvp, _lowered)
 ad.primitive_transposes[ONE_FUNCTION] = _transpose
-mlir.register_lowering(ONE_FUNCTION, mlir.lower_fun(_lowered))
 
 
 def split(which: Sequence[bool], values: Sequence[Any]) -> tuple[list, list]:

@@ -15,7 +15,7 @@ from ..._programs import compiled, run_side_by_side
 # into the cache of a core, and all wait for the slowest. (Lanes of small systems run one
 # after the other in any case.)
 _BATCH_ON_CPU = 16
-# Lanes that run side by side are divided into chunks by their own program.
+# The fewest lanes of a batch that runs side by side, which its own program divides again.
 _BATCH_SIDE_BY_SIDE = 416
 
 
@@ -61,7 +61,7 @@ class Chunk:
         if batch_size is None:
             batch_size = share
             if devices[0].platform == "cpu":
-                many = min(_BATCH_SIDE_BY_SIDE, share)
+                many = -(-share // max(share // _BATCH_SIDE_BY_SIDE, 1))
                 is_side_by_side = run_side_by_side(traced.jaxpr.jaxpr, many)
                 batch_size = many if is_side_by_side else _BATCH_ON_CPU
         batch_size = min(batch_size, share)
