@@ -22,7 +22,7 @@ from .entries import (
 from .evaluation import Evaluation
 from .kernels import has_kernels
 from .loops import Stack
-from .planning import plan_of
+from .planning import num_operations, plan_of
 
 
 _Output: TypeAlias = list[Number] | Stack
@@ -32,6 +32,7 @@ class ProgramInLanes:
     """A program as a function of arrays whose last axis is that of the lanes.
 
     - `needed`: the numbers of the inputs that it takes, of those that are not known.
+    - `length`: the number of its operations.
     - `same`: for each output the number of the input that it is equal to, or `None`. Such
       outputs are not computed.
     """
@@ -54,6 +55,7 @@ class ProgramInLanes:
         self._computed = [(x, aval) for x, aval, same in pairs if same is None]
         flat = (x for xs, _ in self._computed if isinstance(xs, list) for x in xs)
         self._plan = plan_of(region, flat)
+        self.length = num_operations(self._plan)
         read = set(self._plan.inputs)
         self.needed = [k for k, x in enumerate(inputs) if not read.isdisjoint(x)]
         self._inputs = [inputs[k] for k in self.needed]

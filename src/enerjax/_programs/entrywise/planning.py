@@ -71,6 +71,12 @@ def plan_of(region: Region, numbers: Iterable[Number]) -> Plan:
     return Plan(kernels[::-1], loops[::-1], list(needed))
 
 
+def num_operations(plan: Plan) -> int:
+    """The operations of a plan, with one pass of each loop."""
+    own = sum(len(kernel.entries) for kernel in plan.kernels)
+    return own + sum(num_operations(body) for _, body in plan.loops)
+
+
 def _rows(loop: While | Scan) -> list[tuple[Entry, list[Number]]]:
     return loop.rows if isinstance(loop, Scan) else []
 

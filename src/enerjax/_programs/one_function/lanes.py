@@ -32,6 +32,9 @@ _WIDEST = 104
 # Lanes side by side are a multiple of the first number, the width of vector registers, and
 # none of the second: vectors at such distances share few places of the cache.
 _ROUND, _ALIASED = 8, 64
+# Programs with more operations than this compile for longer by ten seconds and more (a heavy
+# top in Euler parameters, two hinged bodies), and need this many times as many lanes.
+_LONG, _MORE = 4_500, 50
 
 
 def _lanes(numbers: Any, axes: Any, *, program: Program) -> tuple[list, list[int]]:
@@ -43,19 +46,21 @@ def _lanes(numbers: Any, axes: Any, *, program: Program) -> tuple[list, list[int
     size = next(len(x) for x, on in zip(own, batched, strict=True) if on)
     out = None
     if _is_worth(program, size) and not any(map(_is_sharded, own)):
-        if _side_by_side(program) is not None:
+        other = _side_by_side(program)
+        is_long = other is not None and other.length > _LONG
+        if other is not None and _is_worth(program, size, _MORE if is_long else 1):
             out = IN_LANES.bind(*own, program=program, batched=tuple(batched))
     if out is None:
         out = _in_turn(program, program.own(own), program.own(batched))
     return out, [0] * len(out)
 
 
-def _is_worth(program: Program, lanes: int) -> bool:
+def _is_worth(program: Program, lanes: int, times: int = 1) -> bool:
     """Whether lanes run side by side, if that is possible."""
     other = program.in_lanes
     if other is None or (other.if_long and program.is_possible):
         return False
-    return lanes >= other.fewest
+    return lanes >= times * other.fewest
 
 
 def run_side_by_side(jaxpr: Any, lanes: int) -> bool:
