@@ -32,7 +32,7 @@ _WIDEST = 104
 # Lanes side by side are a multiple of the first number, the width of vector registers, and
 # none of the second: vectors at such distances share few places of the cache.
 _ROUND, _ALIASED = 8, 64
-# Programs with more operations than this compile for longer by ten seconds and more (a heavy
+# Programs with more operations than this compile for ten seconds longer and more (a heavy
 # top in Euler parameters, two hinged bodies), and need this many times as many lanes.
 _LONG, _MORE = 4_500, 50
 
@@ -47,9 +47,10 @@ def _lanes(numbers: Any, axes: Any, *, program: Program) -> tuple[list, list[int
     out = None
     if _is_worth(program, size) and not any(map(_is_sharded, own)):
         other = _side_by_side(program)
-        is_long = other is not None and other.length > _LONG
-        if other is not None and _is_worth(program, size, _MORE if is_long else 1):
-            out = IN_LANES.bind(*own, program=program, batched=tuple(batched))
+        if other is not None:
+            times = _MORE if other.length > _LONG else 1
+            if _is_worth(program, size, times):
+                out = IN_LANES.bind(*own, program=program, batched=tuple(batched))
     if out is None:
         out = _in_turn(program, program.own(own), program.own(batched))
     return out, [0] * len(out)
