@@ -54,11 +54,11 @@ def preserving() -> Callable:
 
 def cases(quick: bool) -> dict[str, tuple[Callable, dict[str, Any], dict[str, Any]]]:
     """For each name the function of a lane, the parameters, and those of each lane."""
-    count = 500 if quick else 10_000
+    count = 2_000 if quick else 10_000
     m, h = batch.lanes(count)
     lanes = {"lane": {"m": m, "h": h}}
     inner = preserving()
-    sizes = (5, 20, 5) if quick else (10, 40, 25)
+    sizes = (5, 20, 20) if quick else (10, 40, 25)
     grid = {
         "alpha": np.linspace(0.0, 1.0, sizes[0]),
         "h": np.linspace(0.5, 1.5, sizes[1]) * batch.H,
