@@ -1,20 +1,28 @@
-"""Ten thousand double pendulums in one batch, compared with diffrax.
+"""Batches of runs with different parameters, compared with single runs and with diffrax.
 
-    python benchmarks/batch.py [--out FOLDER] [--quick]
+    python benchmarks/batch.py [--out FOLDER] [--quick] [--only WORK]
 
-The masses and the length of the step differ in each lane; all are released from the
-horizontal. `EnergyPreserving()` and diffrax (the extra `peers`; Tsit5 with the same fixed
-steps, in the same Cartesian coordinates with the multipliers solved for) run as a `vmap`
-over all lanes, and as a `lax.map` over chunks of them. Some lanes are compared with
-explicit Runge-Kutta runs in minimal coordinates, and one with its run alone; a wrong answer
-is reported and not timed. Times are medians over interleaved repeats, with XLA's default
-settings and with `enable_fast_loops()` (two processes) on one core, or on the GPU that JAX
-finds. Writes batch.json and batch.png.
+Four works: double pendulums, heavy tops, two hinged bodies in space, and car axes with a
+driven mount. A parameter and the length of the step differ in each lane. Ours,
+`EnergyPreserving()`, runs as a `vmap` over all lanes, and alone; diffrax (the extra
+`peers`; Tsit5 with the same fixed steps, on the same model with the constraints
+differentiated twice) as a `vmap`, and as a `lax.map` over chunks of lanes, of which the
+fastest counts. Forward runs and their gradients by the parameter. A lane is compared with
+its run alone, the energy with its balance, and the end with that of diffrax; a wrong answer
+is reported and not timed. Times are medians over interleaved repeats on one core with XLA's
+default settings, or on the GPU that JAX finds. At last a sweep of double pendulums runs on
+one and on two host devices, by the wall clock and on all cores of the machine.
+Writes batch.json and batch.png.
 """
 
+import json
+import os
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import harness
 import jax
@@ -25,25 +33,62 @@ import enerjax as ej
 
 
 H = 1e-3
-# The largest errors of a correct result: of positions, of the energy (about 10 J are
-# exchanged between its forms), and of a lane compared with a single run.
-ERROR_BOUND, ENERGY_BOUND, LANE_BOUND = 1e-4, 1e-10, 1e-10
+# The largest differences of a correct result: of a lane from its run alone, of the energy
+# from its balance relative to the largest kinetic or potential energy, of both from diffrax
+# (truncation of the second order), and of gradients, relative to the largest.
+LANE_BOUND, ENERGY_BOUND, ERROR_BOUND, GRADIENT_BOUND = 1e-11, 1e-11, 1e-3, 1e-8
 CHUNKS = (16, 64, 256)
 G = 9.81
+# Asks a child process for the time of a sweep on all devices.
+_SWEEP = "--time-of-a-sweep"
+
+
+class Work(NamedTuple):
+    """Runs of a model whose `args` depend on a number of each lane."""
+
+    mechanism: Callable[[], tuple[ej.AbstractSystem, ej.State, Any]]
+    changed: Callable[[Any, Any], Any]
+    h: float
+    lanes: int
+    steps: int
 
 
 def problem() -> ej.problems.Problem:
     return ej.problems.chain(2, length=2.0, mass=2.0, g=G)
 
 
+def two_bodies() -> tuple[ej.AbstractSystem, ej.State, Any]:
+    from bodies import scene
+
+    return scene(2).build()
+
+
+def scaled(key: str) -> Callable[[Any, Any], Any]:
+    return lambda args, x: args | {key: args[key] * x}
+
+
+WORKS = {
+    "double pendulum": Work(problem, scaled("m"), H, 2080, 200),
+    "heavy top": Work(ej.problems.heavy_top, scaled("m"), 0.2 * H, 416, 200),
+    "two bodies": Work(
+        two_bodies,
+        lambda args, x: args.set(gravity=jnp.stack([0.0 * x, 0.0 * x, -G * x])),
+        H,
+        416,
+        100,
+    ),
+    "car axis": Work(ej.problems.car_axis, scaled("k"), H, 1040, 200),
+}
+
+
 def lanes(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Masses and steps."""
+    """Masses of double pendulums, and steps."""
     rng = np.random.default_rng(0)
     return rng.uniform(0.5, 2.0, (count, 2)), H * rng.uniform(0.5, 1.5, count)
 
 
 def ours(steps: int) -> Callable:
-    """The end of a lane: positions, velocities and Newton corrections of a step."""
+    """The end of a double pendulum: positions, velocities and corrections of a step."""
     system, start, args = problem()
     many_steps = harness.run_of(system, ej.EnergyPreserving(), steps)
 
@@ -55,8 +100,23 @@ def ours(steps: int) -> Callable:
     return run
 
 
+def our_lane(work: Work) -> Callable:
+    """The end of a lane: positions, energy errors and corrections of a step."""
+    system, start, args = work.mechanism()
+    many_steps = harness.run_of(system, ej.EnergyPreserving(), work.steps)
+
+    def run(x, h):
+        solution = many_steps(start, work.changed(args, x), h)
+        audit, stats = solution.audit, solution.stats
+        size = jnp.max(jnp.maximum(jnp.abs(audit.kinetic), jnp.abs(audit.potential)))
+        error = jnp.max(jnp.abs(audit.leak)) / size
+        return solution.ys.q[-1], error, jnp.sum(stats.newton_iterations) / work.steps
+
+    return run
+
+
 def accelerations(q: jax.Array, v: jax.Array, m: jax.Array) -> jax.Array:
-    """Of the points, with the two multipliers that keep the rods."""
+    """Of the points of a double pendulum, with the multipliers that keep the rods."""
     inner, outer = q[:2], q[2:] - q[:2]
     inner_rate, outer_rate = v[:2], v[2:] - v[:2]
     # Phi'' = 0 along the motion: a linear system for the tensions per length.
@@ -76,30 +136,37 @@ def accelerations(q: jax.Array, v: jax.Array, m: jax.Array) -> jax.Array:
     )
 
 
-def diffrax_run(steps: int) -> Callable | None:
+def diffrax_lane(name: str) -> Callable | None:
+    """The end of a lane by diffrax: positions."""
     diffrax = harness.peer("diffrax", "diffrax")
     if diffrax is None:
         return None
-    start = problem().start
+    work = WORKS[name]
+    system, start, args = work.mechanism()
 
-    def rates(t, y, m):
+    def by_hand(t, y, m):
         del t
-        return jnp.concatenate([y[4:], accelerations(y[:4], y[4:], m)])
+        return y[1], accelerations(*y, m)
 
-    def run(m, h):
+    def run(x, h):
+        own = work.changed(args, x)
+        if name == "double pendulum":
+            term, begin = diffrax.ODETerm(by_hand), (start.q, start.v)
+        else:
+            term, begin = ej.to_diffrax(system, start, own)
         solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(rates),
+            term,
             diffrax.Tsit5(),
             0.0,
-            h * steps,
+            h * work.steps,
             h,
-            jnp.concatenate([start.q, start.v]),
-            args=m,
+            begin,
+            args=own["m"] if name == "double pendulum" else None,
             saveat=diffrax.SaveAt(t1=True),
             # The last step may fall a rounding error short of the end.
-            max_steps=steps + 2,
+            max_steps=work.steps + 2,
         )
-        return solution.ys[-1, :4], solution.ys[-1, 4:], jnp.zeros(())
+        return solution.ys[0][-1]
 
     return run
 
@@ -107,108 +174,178 @@ def diffrax_run(steps: int) -> Callable | None:
 def batched(run: Callable, chunk: int, count: int) -> Callable:
     if chunk >= count:
         return jax.vmap(run)
-    return lambda m, h: jax.lax.map(lambda lane: run(*lane), (m, h), batch_size=chunk)
+    return lambda x, h: jax.lax.map(lambda lane: run(*lane), (x, h), batch_size=chunk)
 
 
-def energies(q: np.ndarray, v: np.ndarray, m: np.ndarray) -> np.ndarray:
-    kinetic = 0.5 * np.sum(m * np.sum(v.reshape(-1, 2, 2) ** 2, axis=2), axis=1)
-    return kinetic - G * np.sum(m * q[:, 1::2], axis=1)
+def slope(run: Callable) -> Callable:
+    """The gradient, by the parameter, of a sum over the end of a run."""
+    return jax.grad(lambda x, h: jnp.sum(jnp.sin(run(x, h))))
 
 
-def reference(m: np.ndarray, end: float) -> np.ndarray:
-    """Positions of a lane at its end."""
-    from references import solve, STRETCHED_DOUBLE_PENDULUM
+def rows_of(quick: bool, works: Any) -> list[harness.Row]:
+    rows = []
+    for name in works:
+        work = WORKS[name]
+        work = work._replace(lanes=work.lanes // 4) if quick else work
+        rows += of_work(name, work, quick)
+    return rows
 
-    args = dict(m1=m[0], m2=m[1], l1=1.0, l2=1.0, g=G)
-    return solve(STRETCHED_DOUBLE_PENDULUM, args, np.array([end])).q[-1]
 
+def of_work(name: str, work: Work, quick: bool) -> list[harness.Row]:
+    rng = np.random.default_rng(0)
+    x = rng.uniform(0.8, 1.2, work.lanes)
+    h = work.h * rng.uniform(0.5, 1.5, work.lanes)
+    ours, other = our_lane(work), diffrax_lane(name)
+    rows: list[harness.Row] = []
+    programs: list[Callable] = []
 
-def lane_alone(steps: int = 1000, count: int = 64, lane: int = 7) -> harness.Row:
-    """The difference of a lane from a single run, and the change of its energy."""
-    m, h = lanes(count)
-    run = ours(steps)
-    q, v, _ = jax.jit(jax.vmap(run))(m, h)
-    alone, _, _ = jax.jit(run)(m[lane], h[lane])
-    return dict(
-        lane_difference=float(np.max(np.abs(q[lane] - alone))),
-        lane_energy=float(np.max(np.abs(energies(np.asarray(q), np.asarray(v), m)))),
+    def add(kind: str, code: str, run: Callable, chunk: int) -> Any:
+        """Compiles a program, and returns its result."""
+        single = chunk == 1
+        inputs = (x[0], h[0]) if single else (x, h)
+        fn = run if single else batched(run, chunk, work.lanes)
+        program, seconds = harness.compiled(fn, *inputs)
+        repeats = 20 if single else 1
+        again = lambda: [program(*inputs) for _ in range(repeats)][-1]
+        row = dict(work=name, kind=kind, code=code, chunk=chunk, lanes=len(h))
+        row |= dict(steps=work.steps, compile_s=seconds) | harness.device()
+        row["of"] = work.steps * (repeats if single else work.lanes)
+        rows.append(row)
+        programs.append(again)
+        return jax.tree.map(np.asarray, again())
+
+    q, energy, corrections = add("forward", "enerjax", ours, work.lanes)
+    alone, _, _ = add("forward", "single", ours, 1)
+    rows[0] |= dict(
+        lane_difference=float(np.max(np.abs(q[0] - alone))),
+        energy=float(np.max(energy)),
+        corrections=float(np.mean(corrections)),
     )
-
-
-def rows_of(quick: bool) -> list[harness.Row]:
-    count, steps = (500, 50) if quick else (10_000, 50)
-    m, h = lanes(count)
-    some = range(0, count, count // 4)
-    exact = {lane: reference(m[lane], steps * h[lane]) for lane in some}
-    on_cpu = harness.device()["platform"] == "cpu"
-    chunks = (*(CHUNKS[: 1 if quick else None] if on_cpu else ()), count)
-    alone = lane_alone()
-    rows, programs = [], []
-    for name, run in (("enerjax", ours(steps)), ("diffrax", diffrax_run(steps))):
-        for chunk in chunks:
-            if run is None:
-                continue
-            program, seconds = harness.compiled(batched(run, chunk, count), m, h)
-            q, v, iterations = (np.asarray(x) for x in program(m, h))
-            row: harness.Row = dict(code=name, chunk=chunk, lanes=count, steps=steps)
-            row["error"] = max(float(np.max(np.abs(q[k] - exact[k]))) for k in some)
-            row["energy"] = float(np.max(np.abs(energies(q, v, m))))
-            row |= alone if name == "enerjax" else {}
-            rows.append(row | harness.device())
-            right = row["error"] <= ERROR_BOUND
-            if name == "enerjax":
-                right &= max(row["energy"], row["lane_energy"]) <= ENERGY_BOUND
-                right &= row["lane_difference"] <= LANE_BOUND
-            if not right:
-                print(f"{name} in chunks of {chunk} is wrong: {row}; not timed")
-                continue
-            rows[-1] |= dict(compile_s=seconds, iterations=float(np.mean(iterations)))
-            programs.append(lambda p=program: p(m, h))
-    timed = [row for row in rows if "compile_s" in row]
+    of_end = lambda x, h: ours(x, h)[0]
+    found = add("gradient", "enerjax", slope(of_end), work.lanes)
+    alone = add("gradient", "single", slope(of_end), 1)
+    rows[-2]["lane_difference"] = float(np.abs(found[0] - alone) / np.max(np.abs(found)))
+    right = rows[0]["lane_difference"] <= LANE_BOUND and rows[0]["energy"] <= ENERGY_BOUND
+    right &= rows[-2]["lane_difference"] <= GRADIENT_BOUND
+    for chunk in (*CHUNKS[1 : 2 if quick else None], work.lanes) if other else ():
+        end = add("forward", "diffrax", other, chunk)
+        rows[-1]["error"] = float(np.max(np.abs(end - q)))
+        right &= rows[-1]["error"] <= ERROR_BOUND
+    if other:
+        add("gradient", "diffrax", slope(other), CHUNKS[1])
+    if not right:
+        print(f"{name} is wrong: {rows}; not timed")
+        return rows
     times = harness.medians(programs, 3)
-    for row, seconds in zip(timed, times, strict=True):
-        row["ns_per_lane_step"] = 1e9 * seconds / (count * steps)
+    for row, seconds in zip(rows, times, strict=True):
+        row["ns_per_lane_step"] = 1e9 * seconds / row.pop("of")
+    return rows
+
+
+# All cores ------------------------------------------------------------------------------
+
+
+def seconds_of_a_sweep() -> float:
+    """The time of a sweep on all devices, by the wall clock, without its compilation."""
+    run = ours(200)
+    m, h = lanes(6 * 2080)
+    moments: list[float] = []
+    ej.sweep(
+        lambda lane: run(**lane)[0],
+        {"lane": dict(m=m, h=h)},
+        chunk=2080,
+        progress=lambda done, total: moments.append(time.perf_counter()),
+    )
+    return moments[-1] - moments[0]
+
+
+def rows_of_cores(quick: bool, works: Any) -> list[harness.Row]:
+    """A sweep on as many host devices as there are cores, and on one."""
+    del quick
+    if "double pendulum" not in works or jax.default_backend() != "cpu":
+        return []
+    rows = []
+    for devices in (1, os.cpu_count() or 1):
+        flag = f"--xla_force_host_platform_device_count={devices}"
+        environment = os.environ | dict(XLA_FLAGS=flag)
+        out = subprocess.run(
+            [sys.executable, __file__, _SWEEP],
+            env=environment,
+            stdout=subprocess.PIPE,
+            text=True,
+            check=True,
+        )
+        row = dict(work="double pendulum", kind="sweep", code="enerjax", mode="default")
+        rows.append(row | dict(devices=devices, seconds=json.loads(out.stdout)))
     return rows
 
 
 def show(rows: list[harness.Row]) -> None:
-    """Against the best of diffrax in the same process."""
+    """Against single runs, and against the best of diffrax."""
+    time_of = lambda row: row.get("ns_per_lane_step", np.nan)
     for row in rows:
-        peers = [
-            peer["ns_per_lane_step"]
-            for peer in rows
-            if peer["code"] == "diffrax"
-            and peer["mode"] == row["mode"]
-            and "ns_per_lane_step" in peer
-        ]
-        time = row.get("ns_per_lane_step", np.nan)
-        ratio = f"x {time / min(peers):6.2f}" if peers else ""
+        if row["kind"] == "sweep":
+            print(f"sweep on {row['devices']} devices: {row['seconds']:.2f} s")
+            continue
+        same = [x for x in rows if (x["work"], x["kind"]) == (row["work"], row["kind"])]
+        ratios = ""
+        if row["code"] == "enerjax":
+            for code in ("single", "diffrax"):
+                others = [time_of(x) for x in same if x["code"] == code]
+                ratios += f" {time_of(row) / min(others, default=np.nan):5.2f} {code}"
         print(
-            f"{row['device']:8s} {row['mode']:8s} {row['code']:8s} chunk {row['chunk']:6d} "
-            f"{time:9.1f} ns/lane-step {ratio:9s} error {row['error']:.0e}  energy "
-            f"{row['energy']:.0e}  alone {row.get('lane_difference', np.nan):.0e}  "
-            f"iterations {row.get('iterations', np.nan):4.2f}  "
-            f"compile {row.get('compile_s', np.nan):5.1f} s"
+            f"{row['work']:16s} {row['kind']:8s} {row['code']:8s} chunk {row['chunk']:5d} "
+            f"{time_of(row):9.1f} ns/lane-step{ratios:28s} "
+            f"compile {row['compile_s']:5.1f} s"
+            + "".join(
+                f"  {key} {row[key]:.2g}"
+                for key in ("lane_difference", "energy", "error", "corrections")
+                if key in row
+            )
         )
 
 
 def draw(rows: list[harness.Row], path: Path) -> None:
     import matplotlib.pyplot as plt
 
-    figure, axis = plt.subplots(figsize=(6, 4), layout="constrained")
-    keys = sorted({(row["code"], row["mode"]) for row in rows})
-    for code, mode in keys:
-        line: list[Any] = [
-            (row["chunk"], row["ns_per_lane_step"])
-            for row in rows
-            if (row["code"], row["mode"]) == (code, mode) and "ns_per_lane_step" in row
+    figure, axis = plt.subplots(figsize=(7, 4), layout="constrained")
+    works = list(dict.fromkeys(row["work"] for row in rows))
+    place = np.arange(len(works))
+    bars = [
+        (code, kind)
+        for kind in ("forward", "gradient")
+        for code in ("enerjax", "single", "diffrax")
+    ]
+    for k, (code, kind) in enumerate(bars):
+        heights = [
+            min(
+                (
+                    row.get("ns_per_lane_step", np.nan)
+                    for row in rows
+                    if (row["work"], row["code"], row["kind"]) == (work, code, kind)
+                ),
+                default=np.nan,
+            )
+            for work in works
         ]
-        style = "o-" if code == "enerjax" else "s--"
-        axis.loglog(*np.array(line).T, style, label=f"{code}, {mode}")
-    axis.set(xlabel="lanes in a chunk", ylabel="ns per lane and step")
-    axis.legend()
+        axis.bar(place + 0.13 * (k - 2.5), heights, 0.13, label=f"{code}, {kind}")
+    axis.set_xticks(place, works)
+    axis.set(ylabel="ns per lane and step", yscale="log")
+    axis.legend(fontsize=8)
     figure.savefig(path, dpi=130)
 
 
 if __name__ == "__main__":
-    harness.run(__file__, rows_of, show, draw)
+    if _SWEEP in sys.argv:
+        jax.config.update("jax_enable_x64", True)
+        print(seconds_of_a_sweep())
+    else:
+        harness.run(
+            __file__,
+            rows_of,
+            show,
+            draw,
+            peers=rows_of_cores,
+            modes=("default",),
+            works=tuple(WORKS),
+        )

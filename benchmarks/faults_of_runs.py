@@ -63,8 +63,8 @@ FAULTS = (
     ),
     Fault(
         "run: a failed chord method is the end",
-        "_run/without_jacobian.py",
-        "any(bool(result == failure) for failure in _OF_SEARCH)",
+        "_run/simulate.py",
+        "alone and bool(may_need_newton(solution.result))",
         "False",
         "A run without the exact Jacobian that fails is not made again with it.",
         of("chord::test_a_run_that_needs_newton_is_made_again_with_it_once"),

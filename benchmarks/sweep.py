@@ -4,10 +4,10 @@
 
 Twice: the double pendulums of `batch.py` (`EnergyPreserving()`, two masses and the step of
 each lane), and `EnergyConsistent(alpha)` over a grid of alpha, h and a mass. Each runs with
-`ej.sweep`, and as `batch.py` runs it: a `lax.map` over chunks of 16 lanes, one program for
-all, compiled before it is timed. The results must agree. Of a sweep the time counts from
-its second chunk on, since the first one compiles; its programs are counted. Writes
-sweep.json and sweep.png.
+`ej.sweep`, whose lanes run side by side, and as a `lax.map` over batches of 16 lanes, which
+run one after the other: one program for all, compiled before it is timed. The results must
+agree. Of a sweep the time counts from its second chunk on, since the first one compiles;
+its programs are counted. Writes sweep.json and sweep.png.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ import enerjax as ej
 
 # Largest difference of positions between the two, which are compiled differently.
 BOUND = 1e-10
-STEPS, CHUNK = 50, 250
+STEPS, CHUNK = 50, 1000
 
 
 def consistent() -> Callable:
@@ -54,11 +54,11 @@ def preserving() -> Callable:
 
 def cases(quick: bool) -> dict[str, tuple[Callable, dict[str, Any], dict[str, Any]]]:
     """For each name the function of a lane, the parameters, and those of each lane."""
-    count = 500 if quick else 10_000
+    count = 2_000 if quick else 10_000
     m, h = batch.lanes(count)
     lanes = {"lane": {"m": m, "h": h}}
     inner = preserving()
-    sizes = (5, 20, 5) if quick else (10, 40, 25)
+    sizes = (5, 20, 20) if quick else (10, 40, 25)
     grid = {
         "alpha": np.linspace(0.0, 1.0, sizes[0]),
         "h": np.linspace(0.5, 1.5, sizes[1]) * batch.H,

@@ -1,5 +1,6 @@
 """The outcomes of a step. A failure is a value that each step of each lane returns."""
 
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -120,6 +121,20 @@ def from_root_finder(found: Flag, broken: Flag, finite: Flag) -> RESULTS:
     breakdown = RESULTS.where(finite, RESULTS.singular, RESULTS.nonfinite)
     failure = RESULTS.where(broken, breakdown, RESULTS.not_converged)
     return RESULTS.where(found, RESULTS.successful, failure)
+
+
+# The failures of a step that Newton's method may mend.
+_OF_SEARCH = (
+    RESULTS.not_converged,
+    RESULTS.singular,
+    RESULTS.nonfinite,
+    RESULTS.step_too_large,
+)
+
+
+def may_need_newton(result: RESULTS) -> Flag:
+    """Whether a step without Newton's method may have failed for want of it."""
+    return functools.reduce(jnp.logical_or, (result == failure for failure in _OF_SEARCH))
 
 
 def first_of(results: RESULTS) -> RESULTS:

@@ -12,6 +12,7 @@ from .compiled import (
 )
 from .counting import num_operations as num_operations
 from .digest import checksum as checksum, digest as digest
+from .entrywise import known_zeros as known_zeros
 from .fast_loops import enable_fast_loops as enable_fast_loops
 from .hashable_indices import Indices as Indices
 from .jaxprs import (
@@ -26,6 +27,8 @@ from .jaxprs import (
 from .one_function.api import (
     in_one_function as in_one_function,
     part as part,
+    run_side_by_side as run_side_by_side,
+    SideBySide as SideBySide,
     unmerged as unmerged,
 )
 from .one_function.obstacles import why_not_one_function as why_not_one_function

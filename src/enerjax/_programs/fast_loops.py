@@ -46,6 +46,11 @@ def enable_fast_loops() -> None:
         )
 
 
+def are_enabled() -> bool:
+    """Whether loops of any size are compiled into one function."""
+    return _FLAGS[0].partition("=")[2].partition("=")[0] in os.environ.get("XLA_FLAGS", "")
+
+
 def _are_fast() -> bool:
     """Whether XLA compiles a loop into one function that is too large for its default."""
     cpu = jax.devices("cpu")[0]

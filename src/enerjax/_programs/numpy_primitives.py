@@ -33,7 +33,9 @@ def _pad(x, filling, *, padding_config, **_):
         max(n + (n - 1) * inner, 0)
         for n, (_, _, inner) in zip(np.shape(x), padding_config, strict=True)
     ]
-    spread = np.full(lengths, filling, dtype=float)
+    # Programs can be evaluated entry by entry, with entries that are objects.
+    kind = object if x.dtype == object else float
+    spread = np.full(lengths, filling, dtype=kind)
     spread[tuple(slice(None, None, inner + 1) for _, _, inner in padding_config)] = x
     added = [(max(low, 0), max(high, 0)) for low, high, _ in padding_config]
     spread = np.pad(spread, added, constant_values=filling)
@@ -124,11 +126,13 @@ def _select(which, *cases, **_):
 
 
 _FUNCTIONS: dict[str, Callable] = {
+    "abs": np.abs,
     "add": np.add,
     "and": np.bitwise_and,
     "eq": np.equal,
     "ge": np.greater_equal,
     "gt": np.greater,
+    "is_finite": np.isfinite,
     "le": np.less_equal,
     "lt": np.less,
     "max": np.maximum,
@@ -136,7 +140,9 @@ _FUNCTIONS: dict[str, Callable] = {
     "mul": np.multiply,
     "ne": np.not_equal,
     "neg": np.negative,
+    "not": np.invert,
     "or": np.bitwise_or,
+    "sqrt": np.sqrt,
     "sub": np.subtract,
 }
 

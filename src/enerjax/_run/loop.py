@@ -1,5 +1,7 @@
 """The loop over the steps of a run."""
 
+import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -8,19 +10,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from .._operators import AbstractModel
+from .._operators import AbstractModel, SeparableModel
 from .._programs import in_any_lane
-from .._results import first_failure, RESULTS
-from .._solvers import ChordAlone, RootFinder
+from .._results import first_failure, may_need_newton, RESULTS
+from .._solvers import ChordAlone, Newton, RootFinder
 from .._system import State
 from .._types import Count, Flag, Multipliers, Scalar
-from ..schemes import AbstractScheme, Energies
+from ..schemes import AbstractScheme, AbstractSchemeWithChord, Energies
 from .event_search import Found, no_search, settle, Watch
 from .halving import select
-from .reverse import keep_roots, loops
+from .reverse import Bodies, keep_roots, loops
 from .saving import Begin, Costs, Record, with_time
+from .stage import num_unknowns
 from .step import advance, first_warm, model_for, StepOutput, Warm
-from .step_sizes import AbstractPlan, Verdict
+from .step_sizes import AbstractPlan, EqualPlan, Verdict
 from .watcher import Happening, Watcher
 
 
@@ -43,7 +46,7 @@ class Progress(eqx.Module):
 
 
 class Stepper(eqx.Module):
-    """What all steps of a run have in common."""
+    """What all steps of a run have in common; for `may_have_lanes` see `Task`."""
 
     scheme: AbstractScheme
     model: AbstractModel
@@ -51,6 +54,7 @@ class Stepper(eqx.Module):
     root_finder: RootFinder | ChordAlone
     max_halvings: int | None = eqx.field(static=True)
     watcher: Watcher | None = None
+    may_have_lanes: bool = eqx.field(static=True, default=True)
 
     def model_at(self, progress: Progress) -> AbstractModel:
         """The model that events have left."""
@@ -334,38 +338,98 @@ def run_loop(
         num_groups, steps_in_group, None if plan.is_counted else is_done
     )
 
-    def one_step(progress: Progress, live: Flag) -> tuple[Progress, Attempt]:
-        return stepper.attempt(progress, live & ~is_done(progress))
-
-    def one_group(before: Progress, live: Flag) -> tuple[Progress, Record]:
-        after, attempts = over_steps(keep_roots(one_step), before, steps_in_group, live)
-        numbers = jnp.arange(steps_in_group)
-        last = jnp.max(jnp.where(attempts.accepted, numbers, 0))
-        return after, Record(
-            kept=keep(stepper.model_at(after))(after.state, after.place),
-            multipliers=after.multipliers,
-            details=jax.tree.map(lambda x: x[last], attempts.details),
-            energies=jax.tree.map(jnp.sum, attempts.energies),
-            costs=attempts.costs.total(),
-            place=after.place,
-            reached=jnp.any(attempts.accepted) & (after.result == RESULTS.successful),
-            happening=jax.tree.map(lambda x: x[last], attempts.happening),
-            varying=after.varying,
+    def one_step(stepper: Stepper, progress: Progress, live: Flag):
+        attempt = lambda progress, live: stepper.attempt(
+            progress, live & ~is_done(progress)
         )
+        return keep_roots(attempt)(progress, live)
+
+    def one_group(stepper: Stepper, before: Progress, live: Flag):
+        steps = bodies(stepper, one_step)
+        after, attempts = over_steps(steps, before, steps_in_group, live)
+        kept = keep(stepper.model_at(after))(after.state, after.place)
+        return after, _record_of(after, attempts, kept)
 
     begin = stepper.begin(start)
+    other = for_lanes(stepper, begin)
+
+    def bodies(own: Stepper, body: Callable) -> Bodies:
+        make = other if own is stepper else None
+        side_by_side = None if make is None else lambda *inputs: body(make(), *inputs)
+        is_long = _num_unknowns(begin) > _FEW_IN_LANES
+        return Bodies(functools.partial(body, own), side_by_side, search_fails, is_long)
+
     kept = Begin(
         kept=keep(stepper.model_at(begin))(begin.state, begin.place),
         multipliers=begin.multipliers,
         varying=begin.varying,
     )
-    end, record = over_groups(one_group, begin, num_groups, jnp.array(True))
+    end, record = over_groups(
+        bodies(stepper, one_group), begin, num_groups, jnp.array(True)
+    )
     is_whole_run = end.place >= plan.last
     if end.watch is not None:
         is_whole_run = is_whole_run | end.watch.ended
     arrived = RESULTS.where(is_whole_run, RESULTS.successful, RESULTS.out_of_steps)
     result = first_failure(end.result, arrived)
     return kept, eqx.tree_at(lambda x: x.result, end, result), record
+
+
+def _record_of(after: Progress, attempts: Attempt, kept: PyTree[Any]) -> Record:
+    """The record of a group of attempted steps."""
+    numbers = jnp.arange(attempts.accepted.size)
+    last = jnp.max(jnp.where(attempts.accepted, numbers, 0))
+    return Record(
+        kept=kept,
+        multipliers=after.multipliers,
+        details=jax.tree.map(lambda x: x[last], attempts.details),
+        energies=jax.tree.map(jnp.sum, attempts.energies),
+        costs=attempts.costs.total(),
+        place=after.place,
+        reached=jnp.any(attempts.accepted) & (after.result == RESULTS.successful),
+        happening=jax.tree.map(lambda x: x[last], attempts.happening),
+        varying=after.varying,
+    )
+
+
+# The largest number of unknowns of a step that is computed for many lanes side by side,
+# and the same if a single run is one function. A chain of 8 points, with 32 unknowns, takes
+# a quarter longer side by side; two hinged bodies, which are too long for one function,
+# take two thirds of the time.
+_MANY_IN_LANES, _FEW_IN_LANES = 40, 16
+
+
+def for_lanes(stepper: Stepper, begin: Progress) -> Callable[[], Stepper] | None:
+    """The steps for lanes of a batch side by side, which have no exact Jacobian.
+
+    Lanes whose steps need it are computed again with it.
+    """
+    newton, stage, model = stepper.root_finder, stepper.scheme.stage, stepper.model
+    if (
+        not (isinstance(newton, Newton) and newton.linear_solver is None)
+        or not (stepper.may_have_lanes and isinstance(stepper.plan, EqualPlan))
+        or not isinstance(stage, AbstractSchemeWithChord)
+        or not (isinstance(model, SeparableModel) and model.has_delassus_matrix)
+        or stepper.watcher is not None
+        or model.system.redundant
+        or _num_unknowns(begin) > _MANY_IN_LANES
+    ):
+        return None
+    # The zeros must become known where the steps are traced.
+    return lambda: dataclasses.replace(
+        stepper,
+        model=model.with_known_zeros(begin.state),
+        root_finder=ChordAlone(newton, if_small=True),
+    )
+
+
+def _num_unknowns(begin: Progress) -> int:
+    return num_unknowns(jax.tree.map(lambda x: x[0], begin.warm.stages))
+
+
+def search_fails(before: Progress, after: Progress) -> Flag:
+    """Whether a step between two states has failed, perhaps for want of Newton's method."""
+    return (before.result == RESULTS.successful) & may_need_newton(after.result)
 
 
 def _check_start(

@@ -76,10 +76,14 @@ def memory_after(
         return max_norm(jax.tree.map(difference, added, guess, unknown_scale))
 
     smooth, last = _candidates(memory)
+    # A search by the chord method alone has no factors; those of earlier steps are kept.
+    factors = memory.factors
+    if root.factors is not None:
+        factors = jax.tree.map(_shifted, root.factors, memory.factors)
     return Memory(
         added=jax.tree.map(_shifted, added, memory.added),
         is_smooth=error(smooth) <= error(last),
-        factors=jax.tree.map(_shifted, root.factors, memory.factors),
+        factors=factors,
         chord_wait=_wait_after(memory.chord_wait, root),
         carried=carried,
     )

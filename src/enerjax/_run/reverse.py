@@ -9,23 +9,41 @@ and repeat Newton's method, so that their memory grows like `sqrt(n)`.
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._programs import in_any_lane, in_one_function
+from .._programs import in_any_lane, in_one_function, SideBySide
 from .._solvers import ROOT
 from .._types import Flag
 
 
 # With more steps than this the roots are not kept.
 LONG = 10_000
+# The fewest lanes of a batch, and steps of all its lanes together, for which the program
+# for lanes side by side is made: it takes seconds to compile.
+_FEWEST_LANES, _FEWEST_STEPS = 64, 20_000
 
 Body: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]
-# `scan(body, carry, count, live)` calls `body(carry, live)` `count` times.
-Scan: TypeAlias = Callable[[Body, Any, int, Flag], tuple[Any, Any]]
+
+
+class Bodies(NamedTuple):
+    """The body of a loop, and the one for lanes side by side, if there is one.
+
+    - `has_failed(before, after)`: whether it has failed in passes between two carries.
+    - `if_long`: see `SideBySide`.
+    """
+
+    body: Body
+    side_by_side: Body | None
+    has_failed: Callable[[Any, Any], Flag]
+    if_long: bool
+
+
+# `scan(bodies, carry, count, live)` calls `body(carry, live)` `count` times.
+Scan: TypeAlias = Callable[[Bodies, Any, int, Flag], tuple[Any, Any]]
 
 
 # XLA cannot merge a recomputation with the original across the passes of a loop.
@@ -54,14 +72,15 @@ def loops(
     return in_segments, _scan
 
 
-def _scan(body: Body, carry: Any, count: int, live: Flag) -> tuple[Any, Any]:
-    return jax.lax.scan(lambda carry, _: body(carry, live), carry, None, length=count)
+def _scan(bodies: Bodies, carry: Any, count: int, live: Flag) -> tuple[Any, Any]:
+    turn = lambda carry, _: bodies.body(carry, live)
+    return jax.lax.scan(turn, carry, None, length=count)
 
 
 def _in_segments(
     total: int,
     length: int,
-    body: Body,
+    bodies: Bodies,
     carry: Any,
     count: int,
     live: Flag,
@@ -77,12 +96,24 @@ def _in_segments(
 
     # Whether a pass is live is computed within its segment. An array of flags for all
     # passes would take more memory than the reverse pass of a long run keeps.
-    def passes(carry: Any, inputs: tuple[Array, Flag]) -> tuple[Any, Any]:
+    def passes(body: Body, carry: Any, inputs: tuple[Array, Flag]) -> tuple[Any, Any]:
         first, live = inputs
         one_pass = lambda carry, k: body(carry, live & (first + k < count))
         return jax.lax.scan(one_pass, carry, jnp.arange(size))
 
-    segment = in_one_function(keep_roots(passes))
+    lanes = None
+    if bodies.side_by_side is not None:
+        body = bodies.side_by_side
+
+        def side_by_side(carry: Any, inputs: tuple[Array, Flag]) -> tuple[Any, Flag]:
+            out = passes(body, carry, inputs)
+            return out, bodies.has_failed(carry, out[0])
+
+        fewest = max(_FEWEST_LANES, -(-_FEWEST_STEPS // total))
+        lanes = SideBySide(side_by_side, fewest, bodies.if_long)
+
+    whole = functools.partial(passes, bodies.body)
+    segment = in_one_function(keep_roots(whole), lanes)
     if total > LONG:
         segment = _checkpoint(segment)
     if done is not None:

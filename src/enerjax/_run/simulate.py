@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from .._programs import at_top_level, compiled
 from .._progress import Progress
-from .._results import RESULTS
+from .._results import may_need_newton, RESULTS
 from .._solvers import Newton, RootFinder
 from .._system import AbstractSystem, State
 from .._types import Args, Real, Scalar
@@ -23,7 +23,7 @@ from .stage import is_chord_alone
 from .step_sizes import AbstractController, EqualSteps, find_end
 from .task import Task
 from .watcher import watcher_of
-from .without_jacobian import chord_alone, may_need_newton, remember_newton
+from .without_jacobian import chord_alone, remember_newton
 
 
 def simulate(
@@ -171,11 +171,12 @@ def _whole(task: Task, num_rows: int) -> tuple[Solution, Scalar]:
     """A run in one piece, and the time that it has reached."""
     quick = None
     if at_top_level(task):
+        task = dataclasses.replace(task, may_have_lanes=False)
         if task.watcher is None:
             task = dataclasses.replace(task, plan=task.plan.rounded_up())
         quick = chord_alone(task)
     solution, reached, alone = _run(task if quick is None else quick)
-    if alone and may_need_newton(solution.result):
+    if alone and bool(may_need_newton(solution.result)):
         solution, reached, _ = _run(task)
         if bool(solution.result == RESULTS.successful):
             remember_newton(task)

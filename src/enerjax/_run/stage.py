@@ -144,7 +144,7 @@ def solve(
         z = jax.tree.map(jnp.multiply, x, unknown_scale)
         return jax.tree.map(jnp.divide, scheme.residual(z, problem), row_scale)
 
-    wait = memory.chord_wait
+    wait, alone = memory.chord_wait, is_chord_alone(root_finder, memory)
     root = find_root(
         scaled,
         root_finder,
@@ -152,11 +152,11 @@ def solve(
         (scheme, problem, unknown_scale, row_scale),
         max_iterations=MAX_ITERATIONS,
         others=prepared.others,
-        factors=prepared.factors,
+        factors=None if alone else prepared.factors,
         skip=skip,
         regularisation=_regularisation(model, unknown_scale, row_scale),
         least=prepared.least,
-        chord=None if wait is None else _chord(scheme),
+        chord=_chord(scheme) if alone or wait is not None else None,
         by_chord=True if wait is None else wait == 0,
         rarely=rarely or wait is not None,
     )
@@ -166,7 +166,9 @@ def solve(
 
 def is_chord_alone(root_finder: RootFinder | ChordAlone, memory: Memory) -> bool:
     """Whether the exact Jacobian is left out, because there is a chord method."""
-    return isinstance(root_finder, ChordAlone) and memory.chord_wait is not None
+    return isinstance(root_finder, ChordAlone) and (
+        root_finder.if_small or memory.chord_wait is not None
+    )
 
 
 def unsolved(
@@ -243,10 +245,10 @@ def _solved(
     tests = lambda: _gradients_reverse(model, start, end.state)
     no = jnp.array(False)
     # Where the chord method converges, the gradients have hardly changed.
-    if memory.chord_wait is None:
-        reverses = tests()
-    elif is_chord_alone(root_finder, memory):
+    if is_chord_alone(root_finder, memory):
         reverses = no
+    elif memory.chord_wait is None:
+        reverses = tests()
     else:
         reverses = jax.lax.cond(root.by_chord, lambda: no, tests)
     branch = RESULTS.where(reverses, RESULTS.step_too_large, RESULTS.successful)

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 
 from .._operators import SeparableModel
 from .._programs import compiled_for_once, is_known, jacobian_pattern, structure_of
-from .._results import RESULTS
 from .._solvers import ChordAlone, Newton
 from .._system import State, System
 from .._types import Scalar
@@ -32,13 +31,6 @@ from .task import Task
 _CONTRACTS = 0.25
 # The passes of the power iteration; the estimate needs no digits.
 _PASSES = 10
-# The failures of a step that Newton's method may mend.
-_OF_SEARCH = (
-    RESULTS.not_converged,
-    RESULTS.singular,
-    RESULTS.nonfinite,
-    RESULTS.step_too_large,
-)
 
 
 @dataclasses.dataclass
@@ -76,11 +68,6 @@ def chord_alone(task: Task) -> Task | None:
     if not experience.is_linear and bool(_contraction(task) > _CONTRACTS):
         return None
     return dataclasses.replace(task, root_finder=ChordAlone(newton))
-
-
-def may_need_newton(result: RESULTS) -> bool:
-    """Whether a run with this result may have failed for want of Newton's method."""
-    return any(bool(result == failure) for failure in _OF_SEARCH)
 
 
 def remember_newton(task: Task) -> None:

@@ -82,9 +82,12 @@ class ChordAlone(eqx.Module):
 
     The exact Jacobian is more than half of the program of a step, and smooth motion does
     not need it. `newton` has the tolerances; it searches where there is no chord method.
+
+    - `if_small`: whether small systems, too, use the chord method.
     """
 
     newton: Newton
+    if_small: bool = eqx.field(static=True, default=False)
 
 
 class Start(eqx.Module):

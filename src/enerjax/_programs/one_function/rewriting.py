@@ -155,7 +155,7 @@ _UNROLLED = 8
 
 def _scattered(name: str, values: list[Any], params: dict[str, Any]) -> Array:
     operand, index, updates = values
-    places = _places(operand.shape, index, updates.shape, params)
+    places = places_of_updates(operand.shape, index, updates.shape, params)
     updates, size = jnp.ravel(updates), operand.size
     if name == "scatter":
         source, falls = np.arange(size), places >= 0
@@ -232,7 +232,7 @@ def _picked(flat: Array, source: Array | np.ndarray, shape: tuple[int, ...]) -> 
     return flat.at[source].get(mode="promise_in_bounds").reshape(shape)
 
 
-def _places(
+def places_of_updates(
     shape: tuple[int, ...], index: np.ndarray, update_shape: tuple[int, ...], params: Any
 ) -> Int[np.ndarray, " updates"]:
     """The place in the flat array of each flat update; negative if it is dropped."""
