@@ -57,6 +57,7 @@ from .._types import (
     Scalar,
     Velocities,
 )
+from .action import action_of, gradient_in_rows
 from .base import AbstractModel, Position, Reaction
 from .delassus import DelassusMatrix
 from .elements import (
@@ -264,10 +265,10 @@ class SeparableModel(AbstractModel):
         step = h * increment.rate if is_step else None
         rule = self.chain_rule(derivative, step)
         if rule is not None:
-            return self._gradient_in_rows(rule, a, b, h, increment)
+            return gradient_in_rows(self, rule, a, b, h, increment)
         fixed, driven, nonholonomic = self.split(increment, a.q)
         mean_rate, torque = self._mean_rates(a, b, h, increment, is_step)
-        action_of_rates = self._action(h, fixed, nonholonomic)
+        action_of_rates = action_of(self, h, fixed, nonholonomic)
         action = lambda q: action_of_rates(q, mean_rate(q))
         driven_action = lambda q, t: self.driven_action(q, mean_rate(q), t, h, driven)
 
@@ -295,47 +296,6 @@ class SeparableModel(AbstractModel):
             impulse = impulse + h * jax.grad(self._potential)(a.q)
         impulse = self.nonholonomic_impulse(impulse, a, b, nonholonomic)
         return Gradient(impulse, none, work, torque)
-
-    def _action(
-        self, h: Scalar, fixed: Increment, nonholonomic: Increment
-    ) -> Callable[[Coordinates, Coordinates], Scalar]:
-        """`h (V + lambda . Phi + eta . psi)` of coordinates and rates, without the driven
-        constraints."""
-
-        def action(q: Coordinates, rates: Coordinates) -> Scalar:
-            out = h * self._potential(q)
-            if fixed.impulse.size > 0:
-                rows = jnp.concatenate([self.fixed(q), self.coordinate(q)])
-                out = out + fixed.impulse @ rows
-            if fixed.velocity_impulse.size > 0:
-                psi = jax.jvp(self.fixed, (q,), (rates,))[1]
-                out = out + h * fixed.velocity_impulse @ psi
-            if self.has_slip_rate(nonholonomic):
-                psi = self.nonholonomic(q) @ rates
-                out = out + h * nonholonomic.velocity_impulse @ psi
-            return out
-
-        return action
-
-    def _gradient_in_rows(
-        self, rule: RotationRule, a: State, b: State, h: Scalar, increment: Increment
-    ) -> Gradient:
-        """The discrete gradient with respect to the rows of coordinates, rates and time
-        together."""
-        fixed, driven, nonholonomic = self.split(increment, a.q)
-        action = self._action(h, fixed, nonholonomic)
-
-        def both(x: tuple[Coordinates, Coordinates, Time]) -> Scalar:
-            q, rates, t = x
-            if self.system.driven is None:
-                return action(q, rates)
-            return action(q, rates) + self.driven_action(q, rates, t, h, driven)
-
-        at = lambda state: (state.q, self.lift(state.q, state.v), state.t)
-        rows, _, work = rule.gradient(both, at(a), at(b))
-        impulse = self.nonholonomic_impulse(a.q[:0], a, b, nonholonomic)
-        work = None if self.system.driven is None else work
-        return Gradient(impulse, jnp.zeros((0,), h.dtype), work, rows)
 
     def structure(
         self, a: State, b: State, h: Scalar, rate: Increments, gradient: Gradient
