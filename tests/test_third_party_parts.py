@@ -55,7 +55,7 @@ def roll(args=None):
     scene = incline()
     system, start, own = scene.build()
     args = own if args is None else args
-    scheme = ej.EnergyPreserving()
+    scheme = ej.EnergyConsistent(0.0)  # its steps are those of the angle
     return ej.simulate(system, scheme, start, args, h=0.01, num_steps=50)
 
 

@@ -342,6 +342,10 @@ class AbstractModel(eqx.Module):
     def fixed(self, q: Coordinates) -> Float[Array, " nf"]:
         """The scleronomic joints, which do not depend on time."""
 
+    def all_fixed(self, q: Coordinates) -> Float[Array, " nf+ncc"]:
+        """`fixed`, followed by the coordinate constraints."""
+        return jnp.concatenate([self.fixed(q), self.coordinate(q)])
+
     @abc.abstractmethod
     def force(self, q: Coordinates, v: Velocities, t: Time) -> Velocities:
         """`f(q, v, t)` of a system that has forces."""

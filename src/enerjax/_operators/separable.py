@@ -59,6 +59,7 @@ from .._types import (
     Scalar,
     Velocities,
 )
+from .action import action_of, gradient_in_rows
 from .base import AbstractModel, Position, Reaction
 from .delassus import DelassusMatrix
 from .elements import (
@@ -288,10 +289,10 @@ class SeparableModel(AbstractModel):
         step = h * increment.rate if is_step else None
         rule = self.chain_rule(derivative, step)
         if rule is not None:
-            return self._gradient_in_rows(rule, a, b, h, increment)
+            return gradient_in_rows(self, rule, a, b, h, increment)
         fixed, driven, nonholonomic = self.split(increment, a.q)
         mean_rate, torque = self._mean_rates(a, b, h, increment, is_step)
-        action_of_rates = self._action(h, fixed, nonholonomic)
+        action_of_rates = action_of(self, h, fixed, nonholonomic)
         action = lambda q: action_of_rates(q, mean_rate(q))
         driven_action = lambda q, t: self.driven_action(q, mean_rate(q), t, h, driven)
 
@@ -306,7 +307,7 @@ class SeparableModel(AbstractModel):
             impulse = self.nonholonomic_impulse(impulse, a, b, nonholonomic)
             return Gradient(impulse, none, work, torque)
         rows: list[Summands] = [lambda q, fn=fn: h * fn(q) for fn in energies]
-        rows += [lambda q: fixed.impulse * self._all_fixed(q)]
+        rows += [lambda q: fixed.impulse * self.all_fixed(q)]
         if fixed.velocity_impulse.size > 0:
             eta = fixed.velocity_impulse
             rows += [lambda q: h * eta * jax.jvp(self.fixed, (q,), (mean_rate(q),))[1]]
@@ -318,52 +319,6 @@ class SeparableModel(AbstractModel):
             impulse = impulse + h * jax.grad(self._potential)(a.q)
         impulse = self.nonholonomic_impulse(impulse, a, b, nonholonomic)
         return Gradient(impulse, none, work, torque)
-
-    def _all_fixed(self, q: Coordinates) -> Array:
-        """`fixed`, and the constraints between redundant coordinates."""
-        return jnp.concatenate([self.fixed(q), self.coordinate(q)])
-
-    def _action(
-        self, h: Scalar, fixed: Increment, nonholonomic: Increment
-    ) -> Callable[[Coordinates, Coordinates], Scalar]:
-        """`h (V + lambda . Phi + eta . psi)` of coordinates and rates, without the driven
-        constraints."""
-
-        def action(q: Coordinates, rates: Coordinates) -> Scalar:
-            out, num_fixed = h * self._potential(q), fixed.velocity_impulse.size
-            if num_fixed > 0:
-                # Both from one evaluation, which the transpose then passes once.
-                rows, psi = jax.jvp(self._all_fixed, (q,), (rates,))
-                out = out + fixed.impulse @ rows
-                out = out + h * fixed.velocity_impulse @ psi[:num_fixed]
-            elif fixed.impulse.size > 0:
-                out = out + fixed.impulse @ self._all_fixed(q)
-            if self.has_slip_rate(nonholonomic):
-                psi = self.nonholonomic(q) @ rates
-                out = out + h * nonholonomic.velocity_impulse @ psi
-            return out
-
-        return action
-
-    def _gradient_in_rows(
-        self, rule: RotationRule, a: State, b: State, h: Scalar, increment: Increment
-    ) -> Gradient:
-        """The discrete gradient with respect to the rows of coordinates, rates and time
-        together."""
-        fixed, driven, nonholonomic = self.split(increment, a.q)
-        action = self._action(h, fixed, nonholonomic)
-
-        def both(x: tuple[Coordinates, Coordinates, Time]) -> Scalar:
-            q, rates, t = x
-            if self.system.driven is None:
-                return action(q, rates)
-            return action(q, rates) + self.driven_action(q, rates, t, h, driven)
-
-        at = lambda state: (state.q, self.lift(state.q, state.v), state.t)
-        rows, _, work = rule.gradient(both, at(a), at(b))
-        impulse = self.nonholonomic_impulse(a.q[:0], a, b, nonholonomic)
-        work = None if self.system.driven is None else work
-        return Gradient(impulse, jnp.zeros((0,), h.dtype), work, rows)
 
     def structure(
         self, a: State, b: State, h: Scalar, rate: Increments, gradient: Gradient
