@@ -34,7 +34,7 @@ _WIDEST = 104
 _ROUND, _ALIASED = 8, 64
 # Programs with more operations than this compile for ten seconds longer and more (a heavy
 # top in Euler parameters, two hinged bodies), and need this many times as many lanes.
-_LONG, _MORE = 4_500, 50
+_LONG, _MORE = 5_500, 50
 
 
 def _lanes(numbers: Any, axes: Any, *, program: Program) -> tuple[list, list[int]]:
