@@ -218,3 +218,17 @@ def test_another_root_finder_can_be_used(name):
     ours = solve("pendulum", "preserving", 0.0, h=H, steps=STEPS)
     # Solver: its tolerance, over twenty steps.
     np.testing.assert_allclose(run.ys.q, ours.ys.q[:21], rtol=0, atol=1e-9)
+
+
+def test_forces_of_neighbours_that_balance_are_seen_in_every_row():
+    """In a long stiff chain they leave the round-off of each."""
+    count, k = 400, 1e6
+    potential = lambda q, args: 0.5 * k * jnp.sum((jnp.diff(q) - 1.0) ** 2)
+    system = ej.System(lambda v, args: 0.5 * v @ v, potential)
+    start = ej.State(jnp.arange(1.0, count + 1), jnp.zeros(count))
+    model = make_model(system, start, None)
+    sizes = model.force_size(model.to_internal(start)) / (k * start.q)
+    # Each spring has terms of the size `k q`. Estimates by random changes can be small in a
+    # few rows.
+    assert 0.02 < np.min(sizes)
+    assert np.max(sizes) < 4.0

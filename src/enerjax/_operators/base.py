@@ -551,6 +551,8 @@ def row_scales(
 
 # The evaluation of a term takes a few operations, each with a rounding error.
 _OPERATIONS_PER_TERM = 4.0
+# The number of changes of the inputs from which the size of a term is estimated.
+_DRAWS = 3
 
 
 def _term_size(
@@ -571,10 +573,13 @@ def _term_size(
 
     inputs = jax.lax.stop_gradient(inputs)
     flat, unravel = ravel_pytree(inputs)
-    # Multiples of the golden ratio differ from each other modulo one.
-    parts = 0.5 + (0.618034 * np.arange(1, flat.size + 1)) % 1
-    parts = jnp.asarray(parts, flat.dtype)
-    value, change = jax.jvp(of, (inputs,), (unravel(parts * flat),))
+    # Random fractions, because those of a regular sequence cancel in second differences,
+    # such as the forces between the nodes of a beam, and several, because those of one
+    # draw nearly cancel in some rows of many.
+    parts = np.random.default_rng(0).uniform(0.5, 1.5, (_DRAWS, flat.size))
+    moved = jax.vmap(unravel)(jnp.asarray(parts, flat.dtype) * flat[None])
+    value, change_by = jax.linearize(of, inputs)
+    change = jnp.max(jnp.abs(jax.vmap(change_by)(moved)), axis=0)
     # The derivative can be non-finite if `fn` is not differentiable in `args`.
-    size = jnp.abs(value) + jnp.where(jnp.isfinite(change), jnp.abs(change), 0)
+    size = jnp.abs(value) + jnp.where(jnp.isfinite(change), change, 0)
     return jax.lax.stop_gradient(size)
