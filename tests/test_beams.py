@@ -248,7 +248,7 @@ def test_a_flying_beam_keeps_its_balances(spaghetti):
     # After the loads the angular momentum about the origin is kept: solver and round-off.
     inertia = scene.system.inertia(scene.start(), scene.args).diagonal().reshape(-1, 3)
     q, v = (x[t > 2.51].reshape(-1, 17, 3) for x in (sol.ys.q, sol.ys.v))
-    p = inertia * v
+    p = inertia[None] * v
     turning = q[..., 0] * p[..., 1] - q[..., 1] * p[..., 0] + p[..., 2]
     angular = np.sum(turning, axis=1)
     np.testing.assert_allclose(angular, angular[0], rtol=1e-14 * len(angular))
