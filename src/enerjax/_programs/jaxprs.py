@@ -18,6 +18,17 @@ def is_known(tree: Any) -> bool:
     return not any(isinstance(x, Tracer) for x in jax.tree.leaves(tree))
 
 
+def has_numbers(x: Any) -> bool:
+    """Whether the entries of an array, or of its type, are numbers: not random keys."""
+    kind = getattr(x, "dtype", None)
+    return kind is None or not jax.dtypes.issubdtype(kind, jax.dtypes.extended)
+
+
+def known_numbers(x: Any) -> np.ndarray | None:
+    """An array of numbers, if their values are known."""
+    return np.asarray(x) if is_known(x) and has_numbers(x) else None
+
+
 def interpret(
     jaxpr: Any,
     consts: list[Any],
