@@ -109,6 +109,7 @@ def test_what_lanes_cannot_do_is_left_to_other_programs():
         lambda x: jnp.linalg.cholesky(jnp.outer(x, x)),
         lambda x: table[jnp.where(x[0] > 0, 1, 2), jnp.where(x[1] > 0, 1, 2)],
         lambda x: jnp.take(x, jnp.array([0, 3])),
+        lambda x: (x, jax.debug.print("a lane"))[0] + 1,
         lambda x: x + jax.random.uniform(jax.random.key(0)),
         lambda x: x + jax.random.uniform(jax.random.wrap_key_data(x.astype("uint32")[:2])),
     ):

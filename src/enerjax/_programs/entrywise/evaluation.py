@@ -90,8 +90,8 @@ class Evaluation:
             raise UnsupportedError(f"{name} of all passes of a loop")
         if name in LOOPS:
             return LOOPS[name](self, values, params)
-        if any(not has_numbers(x.aval) for x in eqn.outvars):
-            raise UnsupportedError("a random key")
+        if eqn.effects or not all(has_numbers(x.aval) for x in eqn.outvars):
+            raise UnsupportedError(name)
         if all(x.dtype != object for x in map(np.asarray, values)):
             with jax.ensure_compile_time_eval():
                 return list(map(np.asarray, evaluated(eqn.primitive, values, params)))
