@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.extend import source_info_util
@@ -21,7 +22,7 @@ def is_known(tree: Any) -> bool:
 def has_numbers(x: Any) -> bool:
     """Whether the entries of an array, or of its type, are numbers: not random keys."""
     kind = getattr(x, "dtype", None)
-    return kind is None or not jax.dtypes.issubdtype(kind, jax.dtypes.extended)
+    return kind is None or not jnp.issubdtype(kind, jax.dtypes.extended)
 
 
 def known_numbers(x: Any) -> np.ndarray | None:
