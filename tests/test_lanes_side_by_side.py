@@ -67,7 +67,22 @@ def loops(x, y):
     return small, count, rows, last
 
 
-@pytest.mark.parametrize("fn", [arithmetic, places, loops], ids=lambda fn: fn.__name__)
+def tables(x, y):
+    row, column = jnp.where(x[0] > 0, 2, 1), jnp.where(y[0] > 0.5, 2, 0)
+    table, beyond = jnp.arange(9.0).reshape(3, 3), jnp.where(x > 0, 1, 4)
+    filled = [
+        values.at[beyond].get(mode="fill", fill_value=other)
+        for values in (y, jnp.arange(3), jnp.arange(3, dtype=jnp.uint8), y > 0.5)
+        for other in (None, 1)
+    ]
+    one_axis = jax.lax.dynamic_slice(table, (row, 5), (1, 1))
+    return table[row, 1], table[2, column], one_axis, filled
+
+
+CASES_OF_PROGRAMS = [arithmetic, places, loops, tables]
+
+
+@pytest.mark.parametrize("fn", CASES_OF_PROGRAMS, ids=lambda fn: fn.__name__)
 def test_programs_entry_by_entry(fn):
     """Known inputs, too. The differences are round-off: sums have another order."""
     rng = np.random.default_rng(3)
@@ -89,8 +104,19 @@ def test_programs_entry_by_entry(fn):
 
 
 def test_what_lanes_cannot_do_is_left_to_other_programs():
-    unsupported = jax.make_jaxpr(jnp.linalg.cholesky)(jnp.eye(3))
-    assert in_lanes(unsupported.jaxpr, [*unsupported.consts, None]) is None
+    table, key = jnp.arange(9.0).reshape(3, 3), jax.random.key(0)
+    for fn in (
+        lambda x: jnp.linalg.cholesky(jnp.outer(x, x)),
+        lambda x: table[jnp.where(x[0] > 0, 1, 2), jnp.where(x[1] > 0, 1, 2)],
+        lambda x: jnp.take(x, jnp.array([0, 3])),
+        lambda x: (x, jax.debug.print("a lane"))[0] + 1,
+        lambda x: x + jax.random.uniform(jax.random.key(0)),
+        lambda x: x + jax.random.uniform(jax.random.wrap_key_data(x.astype("uint32")[:2])),
+    ):
+        closed = jax.make_jaxpr(fn)(jnp.ones(3))
+        assert in_lanes(closed.jaxpr, [*closed.consts, None]) is None
+    closed = jax.make_jaxpr(lambda x, key: x + jax.random.uniform(key))(1.0, key)
+    assert in_lanes(closed.jaxpr, [None, None]) is None
 
 
 def test_zeros_that_are_known():

@@ -36,6 +36,8 @@ INVARIANTS = dict(
     angle=lambda q: jnp.cos(3 * (q[5] - q[2] - 0.4)),
     far=lambda q: (q[2] - (q[5] + 2.0)) ** 2 * jnp.sum(axes(q[5])[0] * axes(q[2])[1]),
     middle=lambda q: jnp.sum(axes(0.5 * (q[2] + q[5]))[0] * (q[3:5] - q[:2])),
+    turned_round=lambda q: jnp.cosh(0.3 - q[2] + q[5]) * (-(0.5 * q[2]) + q[5] / 2),
+    halves=lambda q: jnp.sum(axes(0.5 * q[2] + 0.5 * q[5])[1] * (q[3:5] - q[:2])),
     tables=lambda q: jnp.sum(jnp.diff(q.reshape(2, 3)[:, 2]) ** 2),
 )
 # Others, for which the rule is right but turns nothing together.

@@ -143,3 +143,9 @@ def test_equal_tables_of_a_simplified_program_are_one():
     assert num_operations(lean, x) == num_operations(once, x)
     assert num_operations(lean, x) < num_operations(repeating, x)
     jax.tree.map(np.testing.assert_array_equal, lean(x), repeating(x))
+
+
+def test_random_keys_can_be_constants_of_a_simplified_program():
+    key = jax.random.key(1)
+    noisy = lambda x: x * jax.random.uniform(key) + jax.random.uniform(key)
+    np.testing.assert_array_equal(simplified(noisy)(2.0), noisy(2.0))

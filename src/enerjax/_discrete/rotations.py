@@ -246,21 +246,28 @@ def _sum(primitive: Any, values: list[Value], params: dict[str, Any]) -> list | 
     a, b = ends(0), ends(1)
     # A constant is another reference for angles, and does not change their increments.
     first, constant = (x, y) if isinstance(x, Turning) else (y, x)
-    if not _moves(constant) and (is_sum or first is x):
-        kept = jnp.shape(first.a) == jnp.shape(a)
-        return [first._replace(a=a, b=b)] if kept else None
-    if not all(isinstance(v, Turning) and v.factor == 1 for v in values):
+    if not _moves(constant):
+        if jnp.shape(first.a) != jnp.shape(a):
+            return None
+        if is_sum or first is x:
+            return [first._replace(a=a, b=b)]
+        return _times(-1, y, a, b)
+    if not all(isinstance(v, Turning) for v in values):
         return None
     if not any(x.are(kind) and y.are(kind) for kind in (ANGLE, RATE)):
         return None
-    if is_sum:
+    factor, other = x.factor, y.factor if is_sum else -y.factor
+    if factor == other:
         return [_mean(x, y, a, b)]
+    if factor != -other:
+        return None
     if x.are(RATE) and y.are(RATE):
-        return [Moving(a, b, x.d - y.d)]
+        return [Moving(a, b, factor * (x.d - y.d))]
     d, total = x.half - y.half, 1 + x.half * y.half
     near = jnp.abs(d) < elementary.SMALL_RATIO * total
-    ratio = elementary.series_or_quotient(near, d, total, elementary.atanc, 0.5 * (b - a))
-    return [Moving(a, b, ratio * (x.d - y.d))]
+    change = 0.5 / factor * (b - a)
+    ratio = elementary.series_or_quotient(near, d, total, elementary.atanc, change)
+    return [Moving(a, b, factor * ratio * (x.d - y.d))]
 
 
 def _end(value: Value, k: int) -> Any:
@@ -268,14 +275,14 @@ def _end(value: Value, k: int) -> Any:
 
 
 def _mean(x: Turning, y: Turning, a: Array, b: Array) -> Turning:
-    """The sum of two angles or rates, as twice their mean."""
+    """The sum of equal multiples of two angles or rates, as a multiple of their mean."""
     c, d = jax.lax.rsqrt(1 + x.half * x.half), jax.lax.rsqrt(1 + y.half * y.half)
     share = c / (c + d)
     mean = lambda u, v: share * u + (1 - share) * v
     turn = mean(x.turn, y.turn)
     change = mean(x.d, y.d) if x.are(ANGLE) and y.are(ANGLE) else 0.5 * (x.d + y.d)
     kinds = np.maximum(x.kinds, y.kinds)
-    return turning(a, b, change, mean(x.half, y.half), turn, kinds, 2.0)
+    return turning(a, b, change, mean(x.half, y.half), turn, kinds, 2 * x.factor)
 
 
 def _multiple(primitive: Any, values: list[Value], params: dict[str, Any]) -> list | None:
@@ -285,9 +292,19 @@ def _multiple(primitive: Any, values: list[Value], params: dict[str, Any]) -> li
     if _moves(y) or not is_known(y) or np.ndim(y) > 0 or (is_quotient and y is values[0]):
         return None
     number = 1 / float(y) if is_quotient else float(y)
+    a, b = (evaluate(primitive, [_end(v, k) for v in values], params)[0] for k in (0, 1))
+    return _times(number, x, a, b)
+
+
+def _negative(primitive: Any, values: list[Value], params: dict[str, Any]) -> list | None:
+    (x,) = values
+    return _times(-1, x, -x.a, -x.b)
+
+
+def _times(number: float, x: Turning, a: Array, b: Array) -> list | None:
+    """A multiple of angles or rates, perhaps plus a constant, with its values."""
     if number == 0 or np.any(x.kinds == OTHER):
         return None
-    a, b = (evaluate(primitive, [_end(v, k) for v in values], params)[0] for k in (0, 1))
     return [x._replace(a=a, b=b, factor=number * x.factor)]
 
 
@@ -298,4 +315,5 @@ _RULES: dict[str, Callable] = {
     "sub": _sum,
     "mul": _multiple,
     "div": _multiple,
+    "neg": _negative,
 }

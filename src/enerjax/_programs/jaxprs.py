@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.extend import source_info_util
@@ -16,6 +17,17 @@ from .primitives import CALLS, JIT, WITH_OWN_DERIVATIVE
 def is_known(tree: Any) -> bool:
     """Whether every number in `tree` has a value now: whether no leaf is traced."""
     return not any(isinstance(x, Tracer) for x in jax.tree.leaves(tree))
+
+
+def has_numbers(x: Any) -> bool:
+    """Whether the entries of an array, or of its type, are numbers: not random keys."""
+    kind = getattr(x, "dtype", None)
+    return kind is None or not jnp.issubdtype(kind, jax.dtypes.extended)
+
+
+def known_numbers(x: Any) -> np.ndarray | None:
+    """An array of numbers, if their values are known."""
+    return np.asarray(x) if is_known(x) and has_numbers(x) else None
 
 
 def interpret(

@@ -81,7 +81,7 @@ def _along(x: np.ndarray, axis: int, rank: int) -> np.ndarray:
     return x.reshape([-1 if k == axis else 1 for k in range(rank)])
 
 
-def _is_inside(x, indices, *, dimension_numbers, slice_sizes, **_) -> bool:
+def is_inside(x, indices, *, dimension_numbers, slice_sizes, **_) -> bool:
     """Whether all slices of a `gather` lie within `x`, so that its mode does not matter."""
     numbers = dimension_numbers
     axes = list(numbers.start_index_map)
@@ -150,7 +150,7 @@ _FUNCTIONS: dict[str, Callable] = {
 def moved(primitive: Any, values: list[Any], params: dict[str, Any]) -> list[Any]:
     """The outputs of a primitive that moves entries, of arrays that are known."""
     values, move = list(map(np.asarray, values)), _EVERY_MOVE.get(primitive.name)
-    if move is None or (move is _gather and not _is_inside(*values, **params)):
+    if move is None or (move is _gather and not is_inside(*values, **params)):
         return evaluate(primitive, values, params)
     return move(*values, **params)
 

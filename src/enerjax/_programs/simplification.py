@@ -16,7 +16,7 @@ from jax.extend.core import Literal
 from jaxtyping import Array, PyTree
 
 from .compiled import is_hashable
-from .jaxprs import evaluate, interpret, is_known
+from .jaxprs import evaluate, interpret, known_numbers
 
 
 # Constants with more numbers than this are not compared.
@@ -50,9 +50,9 @@ def _shared(constants: list[Any]) -> list[Any]:
 
 def _content(constant: Any) -> Any:
     """Equal for arrays of equal numbers; the identity of a traced or a large array."""
-    if not is_known(constant) or np.size(constant) > _MANY:
+    array = known_numbers(constant) if np.size(constant) <= _MANY else None
+    if array is None:
         return id(constant)
-    array = np.asarray(constant)
     return array.tobytes(), array.shape, array.dtype, jnp.asarray(constant).weak_type
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from jax import lax
 from jax.core import Tracer
 
-from ..jaxprs import interpret, wrapped_program
-from ..numpy_primitives import evaluated, moved
+from ..jaxprs import has_numbers, interpret, wrapped_program
+from ..numpy_primitives import evaluated, is_inside, moved
 from ..one_function.possible import NAME
 from ..one_function.rewriting import places_of_updates
 from ..primitives import (
@@ -90,6 +90,8 @@ class Evaluation:
             raise UnsupportedError(f"{name} of all passes of a loop")
         if name in LOOPS:
             return LOOPS[name](self, values, params)
+        if eqn.effects or not all(has_numbers(x.aval) for x in eqn.outvars):
+            raise UnsupportedError(name)
         if all(x.dtype != object for x in map(np.asarray, values)):
             with jax.ensure_compile_time_eval():
                 return list(map(np.asarray, evaluated(eqn.primitive, values, params)))
@@ -196,9 +198,14 @@ class Evaluation:
         x, *starts = values
         x, sizes = objects(x), params["slice_sizes"]
         rooms = [n - size + 1 for n, size in zip(x.shape, sizes, strict=True)]
-        (axis,) = [k for k, room in enumerate(rooms) if room > 1] or [0]
-        if rooms[axis] > _FEW:
+        moving = [k for k, start in enumerate(starts) if _is_unknown(start)]
+        axis = next((k for k in moving if rooms[k] > 1), moving[0])
+        if any(rooms[k] > (_FEW if k == axis else 1) for k in moving):
             raise UnsupportedError("dynamic_slice")
+        for k, start in enumerate(starts):
+            if k not in moving:
+                first = int(np.clip(start, 0, rooms[k] - 1))
+                x = np.take(x, range(first, first + sizes[k]), k)
         (start,) = objects(starts[axis]).ravel()
         part = lambda k: np.take(x, range(k, k + sizes[axis]), axis).ravel()
         out = list(part(0))
@@ -228,12 +235,11 @@ class Evaluation:
         inner = [k for k in range(len(aval.shape)) if k in numbers.offset_dims]
         place = np.broadcast_to(np.expand_dims(index[..., column], inner), aval.shape)
         place, kind = objects(place).ravel(), index.ravel()[0].dtype.type
-        missing = np.nan if np.issubdtype(aval.dtype, np.inexact) else 0
-        out = [np.dtype(aval.dtype).type(missing)] * aval.size if fills else None
+        out = [_missing(params, aval.dtype)] * aval.size if fills else None
         for k in range(room):
             known = np.array(index)
             known[..., column] = k
-            (taken,) = moved(primitive, [x, known.astype(int)], params)
+            (taken,) = _gathered(primitive, [x, known.astype(int)], params)
             taken = list(np.ravel(taken))
             compare = lax.eq_p if fills else lax.ge_p
             is_it = (graph.number(compare, (y, kind(k)), {}, np.bool_) for y in place)
@@ -246,17 +252,36 @@ class Evaluation:
         if indices and any(map(_is_unknown, values[1:])):
             raise UnsupportedError(primitive.name)
         own = [*map(objects, values[:1]), *values[1:]] if indices else map(objects, values)
-        out = moved(primitive, list(own), params)
+        move = _gathered if primitive.name == "gather" else moved
+        out = move(primitive, list(own), params)
         return [
             array_of(np.ravel(x), aval.shape, aval.dtype)
             for x, aval in zip(out, avals, strict=True)
         ]
 
 
+def _gathered(primitive: Any, values: list[Any], params: dict[str, Any]) -> list[Any]:
+    if not is_inside(*values, **params):
+        raise UnsupportedError("gather outside of an array")
+    return moved(primitive, values, params)
+
+
+def _missing(params: dict[str, Any], dtype: Any) -> np.generic:
+    """What a gather returns for places outside of an array; see `jax.lax.gather`."""
+    value = params["fill_value"]
+    if value is None and np.issubdtype(dtype, np.signedinteger):
+        value = np.iinfo(dtype).min
+    elif value is None and np.issubdtype(dtype, np.unsignedinteger):
+        value = np.iinfo(dtype).max
+    elif value is None:
+        value = True if np.dtype(dtype).kind == "b" else np.nan
+    return scalar(value, dtype)
+
+
 def _plain(x: Any) -> Any:
     """A constant of a program; constants that are traced are inputs of the program."""
-    if isinstance(x, Tracer):
-        raise UnsupportedError("a traced constant")
+    if isinstance(x, Tracer) or not has_numbers(x):
+        raise UnsupportedError("a traced constant, or a random key")
     return np.asarray(x)
 
 

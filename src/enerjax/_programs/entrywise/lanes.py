@@ -6,9 +6,9 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, PyTree
 
+from ..jaxprs import has_numbers, known_numbers
 from .emission import computed, value_of
 from .entries import (
     array_of,
@@ -105,8 +105,7 @@ def in_lanes(jaxpr: Any, values: Sequence[np.ndarray | None]) -> ProgramInLanes 
 def known_zeros(fn: Callable[[], PyTree[Array]]) -> PyTree[np.ndarray]:
     """Which entries of the arrays that `fn` returns are zero whatever it depends on."""
     closed, like = jax.make_jaxpr(fn, return_shape=True)()
-    values = [None if isinstance(x, Tracer) else np.asarray(x) for x in closed.consts]
-    found = _evaluated(closed.jaxpr, values)
+    found = _evaluated(closed.jaxpr, list(map(known_numbers, closed.consts)))
     outputs = closed.out_avals if found is None else found[2]
     is_zero = lambda x: isinstance(x, np.generic) and x == 0
     masks = (np.zeros(x.shape, bool) for x in outputs)
@@ -124,7 +123,10 @@ def _evaluated(
     region = Region()
     inputs: list[list[Entry]] = []
     arrays = []
-    for variable, value in zip([*jaxpr.constvars, *jaxpr.invars], values, strict=True):
+    variables = [*jaxpr.constvars, *jaxpr.invars]
+    if not all(has_numbers(x.aval) for x in variables):
+        return None
+    for variable, value in zip(variables, values, strict=True):
         if value is None:
             aval = variable.aval
             inputs.append([Entry(aval.dtype, region) for _ in range(aval.size)])

@@ -7,13 +7,13 @@ from typing import Any, TYPE_CHECKING
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, Primitive
 from jax.interpreters import ad, batching, mlir
 from jax.interpreters.partial_eval import dce_jaxpr_consts
 from jaxtyping import Array, PyTree
 
 from ..counting import num_equations
+from ..jaxprs import known_numbers
 from .marks import marked
 from .possible import has_parts, is_possible, longest, NAME
 from .rewriting import as_index, REWRITTEN, rewritten
@@ -122,8 +122,9 @@ class InLanes:
         self.fewest, self.if_long = when.fewest, when.if_long
         self.jaxpr, of_consts, of_inputs = dce_jaxpr_consts(closed.jaxpr, [*wanted, True])
         needed, _ = split([*of_consts, *of_inputs], [*closed.consts, *numbers])
-        self.known = [None if isinstance(x, Tracer) else np.asarray(x) for x in needed]
-        self.numbers = [x for x in needed if isinstance(x, Tracer)]
+        self.known = list(map(known_numbers, needed))
+        pairs = zip(needed, self.known, strict=True)
+        self.numbers = [x for x, known in pairs if known is None]
 
     @functools.cached_property
     def function(self) -> "ProgramInLanes | None":
