@@ -1,5 +1,6 @@
 """The initial guesses of Newton's method, extrapolated from the last steps."""
 
+import functools
 import math
 from typing import Any
 
@@ -99,8 +100,8 @@ def _wait_after(wait: Count | None, root: Root) -> Count | None:
 def extrapolated(x: Array) -> Array:
     """The next of some values, which are newest first, on a polynomial through all."""
     count = x.shape[0]
-    terms = [(-1) ** k * math.comb(count, k + 1) * x[k] for k in range(count)]
-    return sum(terms[1:], start=terms[0])
+    terms = ((-1) ** k * math.comb(count, k + 1) * x[k] for k in range(count))
+    return functools.reduce(jnp.add, terms)
 
 
 def _shifted(new: Array, old: Array) -> Array:
