@@ -146,7 +146,8 @@ def diffrax_lane(name: str) -> Callable | None:
 
     def by_hand(t, y, m):
         del t
-        return y[1], accelerations(*y, m)
+        q, v = y
+        return v, accelerations(q, v, m)
 
     def run(x, h):
         own = work.changed(args, x)
@@ -227,11 +228,11 @@ def of_work(name: str, work: Work, quick: bool) -> list[harness.Row]:
     rows[-2]["lane_difference"] = float(np.abs(found[0] - alone) / np.max(np.abs(found)))
     right = rows[0]["lane_difference"] <= LANE_BOUND and rows[0]["energy"] <= ENERGY_BOUND
     right &= rows[-2]["lane_difference"] <= GRADIENT_BOUND
-    for chunk in (*CHUNKS[1 : 2 if quick else None], work.lanes) if other else ():
-        end = add("forward", "diffrax", other, chunk)
-        rows[-1]["error"] = float(np.max(np.abs(end - q)))
-        right &= rows[-1]["error"] <= ERROR_BOUND
-    if other:
+    if other is not None:
+        for chunk in (*CHUNKS[1 : 2 if quick else None], work.lanes):
+            end = add("forward", "diffrax", other, chunk)
+            rows[-1]["error"] = float(np.max(np.abs(end - q)))
+            right &= rows[-1]["error"] <= ERROR_BOUND
         add("gradient", "diffrax", slope(other), CHUNKS[1])
     if not right:
         print(f"{name} is wrong: {rows}; not timed")

@@ -1,6 +1,7 @@
 """Bodies in the plane: energy, linear and angular momentum of schemes that keep them."""
 
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -119,7 +120,7 @@ def everything():
         "beam", [[3.0, 1.0], [5.0, 1.0]], section, 2,
         velocity=at(4.0, 1.0), angular_velocity=turn,
     )  # fmt: skip
-    moving = lambda x, y: dict(velocity=at(x, y), angular_velocity=turn)
+    moving: Any = lambda x, y: dict(velocity=at(x, y), angular_velocity=turn)
     parts = [
         rod("a", 1.0, [0.0, 0.0], [1.0, 0.0], **moving(0.5, 0.0)),
         rod("b", 2.0, [1.0, 0.0], [2.0, 0.0], velocity=at(1.5, 0.0) + [0.0, 0.5],
