@@ -26,11 +26,11 @@ SIZE = 30
 # The first guess --------------------------------------------------------------------------
 
 
-def test_a_cubic_motion_is_predicted_exactly():
-    cubic = np.poly1d([0.3, -1.0, 2.0, 0.5])
+def test_a_quadratic_motion_is_predicted_exactly():
+    quadratic = np.poly1d([-1.0, 2.0, 0.5])
     before = np.arange(LAST_STEPS)[::-1]
-    values = jnp.asarray(np.stack([cubic(before), cubic(before + 0.5)], axis=1))
-    expected = [cubic(LAST_STEPS), cubic(LAST_STEPS + 0.5)]
+    values = jnp.asarray(np.stack([quadratic(before), quadratic(before + 0.5)], axis=1))
+    expected = [quadratic(LAST_STEPS), quadratic(LAST_STEPS + 0.5)]
     # Round-off of sums whose terms are at most 100.
     np.testing.assert_allclose(extrapolated(values), expected, rtol=0, atol=1e3 * EPS)
 

@@ -71,7 +71,7 @@ def powers_of(dtype: jnp.dtype) -> Powers:
         small=eps**0.25,
         moderate=eps**0.5,
         tiny=eps**0.75,
-        round_off=eps**0.8125,
+        round_off=eps**0.875,
     )
 
 
