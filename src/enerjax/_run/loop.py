@@ -14,12 +14,12 @@ from .._operators import AbstractModel, SeparableModel
 from .._programs import in_any_lane
 from .._results import first_failure, may_need_newton, RESULTS
 from .._solvers import ChordAlone, Newton, RootFinder
-from .._system import State
+from .._system import AbstractSystem, State, System
 from .._types import Count, Flag, Multipliers, Scalar
 from ..schemes import AbstractScheme, AbstractSchemeWithChord, Energies
 from .event_search import Found, no_search, settle, Watch
 from .halving import select
-from .reverse import Bodies, keep_roots, loops
+from .reverse import keep_roots, LoopBody, loops
 from .saving import Begin, Costs, Record, with_time
 from .stage import num_unknowns
 from .step import advance, first_warm, model_for, StepOutput, Warm
@@ -345,19 +345,22 @@ def run_loop(
         return keep_roots(attempt)(progress, live)
 
     def one_group(stepper: Stepper, before: Progress, live: Flag):
-        steps = bodies(stepper, one_step)
-        after, attempts = over_steps(steps, before, steps_in_group, live)
+        step = loop_body(stepper, one_step)
+        after, attempts = over_steps(step, before, steps_in_group, live)
         kept = keep(stepper.model_at(after))(after.state, after.place)
         return after, _record_of(after, attempts, kept)
 
     begin = stepper.begin(start)
-    other = for_lanes(stepper, begin)
+    stepper_for_lanes = for_lanes(stepper, begin)
+    if_long = _num_unknowns(begin) > _FEW_IN_LANES
 
-    def bodies(own: Stepper, body: Callable) -> Bodies:
-        make = other if own is stepper else None
-        side_by_side = None if make is None else lambda *inputs: body(make(), *inputs)
-        is_long = _num_unknowns(begin) > _FEW_IN_LANES
-        return Bodies(functools.partial(body, own), side_by_side, search_fails, is_long)
+    def loop_body(own: Stepper, fn: Callable) -> LoopBody:
+        in_turn, make = functools.partial(fn, own), stepper_for_lanes
+        # Within a loop of lanes side by side, all loops are for them.
+        if make is None or own is not stepper:
+            return LoopBody(in_turn, None, search_fails, if_long)
+        side_by_side = lambda *inputs: fn(make(), *inputs)
+        return LoopBody(in_turn, side_by_side, search_fails, if_long)
 
     kept = Begin(
         kept=keep(stepper.model_at(begin))(begin.state, begin.place),
@@ -365,7 +368,7 @@ def run_loop(
         varying=begin.varying,
     )
     end, record = over_groups(
-        bodies(stepper, one_group), begin, num_groups, jnp.array(True)
+        loop_body(stepper, one_group), begin, num_groups, jnp.array(True)
     )
     is_whole_run = end.place >= plan.last
     if end.watch is not None:
@@ -392,6 +395,27 @@ def _record_of(after: Progress, attempts: Attempt, kept: PyTree[Any]) -> Record:
     )
 
 
+def dispensable_newton(
+    root_finder: RootFinder | ChordAlone,
+    scheme: AbstractScheme,
+    plan: AbstractPlan,
+    watcher: Watcher | None,
+    system: AbstractSystem,
+) -> Newton | None:
+    """Newton's method of a run whose steps may be tried by the chord method alone, else
+    `None`."""
+    if (
+        not (isinstance(root_finder, Newton) and root_finder.linear_solver is None)
+        or not isinstance(scheme.stage, AbstractSchemeWithChord)
+        or not isinstance(plan, EqualPlan)
+        or watcher is not None
+        or not isinstance(system, System)
+        or system.redundant
+    ):
+        return None
+    return root_finder
+
+
 # The largest number of unknowns of a step that is computed for many lanes side by side,
 # and the same if a single run is one function. A chain of 8 points, with 32 unknowns, takes
 # a quarter longer side by side; two hinged bodies, which are too long for one function,
@@ -404,14 +428,14 @@ def for_lanes(stepper: Stepper, begin: Progress) -> Callable[[], Stepper] | None
 
     Lanes whose steps need it are computed again with it.
     """
-    newton, stage, model = stepper.root_finder, stepper.scheme.stage, stepper.model
+    model = stepper.model
+    newton = dispensable_newton(
+        stepper.root_finder, stepper.scheme, stepper.plan, stepper.watcher, model.system
+    )
     if (
-        not (isinstance(newton, Newton) and newton.linear_solver is None)
-        or not (stepper.may_have_lanes and isinstance(stepper.plan, EqualPlan))
-        or not isinstance(stage, AbstractSchemeWithChord)
+        newton is None
+        or not stepper.may_have_lanes
         or not (isinstance(model, SeparableModel) and model.has_delassus_matrix)
-        or stepper.watcher is not None
-        or model.system.redundant
         or _num_unknowns(begin) > _MANY_IN_LANES
     ):
         return None

@@ -1,7 +1,5 @@
 """The initial guesses of Newton's method, extrapolated from the last steps."""
 
-import functools
-import math
 from typing import Any
 
 import equinox as eqx
@@ -18,15 +16,13 @@ from .._types import Count, Flag, Scalar
 # (stiff forces, fast rotations) usually last for several steps, and each attempt costs a
 # few evaluations of the residual.
 _CHORD_WAITS = 10
-# The number of steps whose unknowns are remembered.
-LAST_STEPS = 3
 
 
 class Memory(eqx.Module):
     """The data of the last steps that a solve uses.
 
-    - `added`: the unknowns of the last `LAST_STEPS` steps minus those of a free flight,
-      newest first.
+    - `added`: the unknowns of the last three steps minus those of a free flight, newest
+      first.
     - `is_smooth`: whether the extrapolation of `added` was a better guess for the last step
       than the step before it.
     - `factors`: the factors of the Jacobians of the last three steps, newest first; `None`
@@ -49,8 +45,8 @@ def predicted(memory: Memory) -> PyTree[Any]:
 
     For a smooth motion this is an extrapolation of the last three steps, and for one that
     changes quickly it is the difference of the last step. The choice is the one that would
-    have been better for the last step. From four steps, the chord method would need fewer
-    corrections in short steps, but a fifth of the runs with long steps would fail.
+    have been better for the last step. An extrapolation of four steps needs fewer
+    corrections in short steps, but more searches fail in long ones.
     """
     smooth, last = _candidates(memory)
     choose = lambda x, y: jnp.where(memory.is_smooth, x, y)
@@ -98,15 +94,13 @@ def _wait_after(wait: Count | None, root: Root) -> Count | None:
 
 
 def extrapolated(x: Array) -> Array:
-    """The next of some values, which are newest first, on a polynomial through all."""
-    count = x.shape[0]
-    terms = ((-1) ** k * math.comb(count, k + 1) * x[k] for k in range(count))
-    return functools.reduce(jnp.add, terms)
+    """The quadratic extrapolation of the last three values, which are newest first."""
+    return 3 * x[0] - 3 * x[1] + x[2]
 
 
 def _shifted(new: Array, old: Array) -> Array:
-    """The last values after a step with the value `new`."""
-    return jnp.concatenate([new[None], old[:-1]])
+    """The last three values after a step with the value `new`."""
+    return jnp.stack([new, old[0], old[1]])
 
 
 def for_length(
@@ -116,9 +110,9 @@ def for_length(
     first, to steps of the length `length`.
 
     What a step adds to a free flight is proportional to its length, so their quotient is
-    extrapolated quadratically from the midpoints of the last three steps. `solve`
-    extrapolates `3 x0 - 3 x1 + x2`, or repeats `x0`: the entries are chosen such
-    that it finds the extrapolated value, or the last one.
+    extrapolated quadratically from the midpoints of the three steps. `solve` extrapolates
+    `3 x0 - 3 x1 + x2`, or repeats `x0`: the entries are chosen such that it finds the
+    extrapolated value, or the last one.
     """
     ends = np.cumsum(stages)
     # The midpoint of a backward stage may lie outside of the step, hence the clipping.
@@ -136,9 +130,9 @@ def for_length(
     def resampled(x: Array) -> Array:
         shaped = lambda w: w.reshape(-1, *[1] * (x.ndim - 2))
         rates = x[:, 0] / a, x[:, 1] / b, x[:, 2] / c
-        rate = sum(shaped(w) * rate for w, rate in zip(weights, rates, strict=True))
-        last, smooth = length * rates[0], length * rate
-        return jnp.stack([last, last, smooth], axis=1)
+        smooth = sum(shaped(w) * rate for w, rate in zip(weights, rates, strict=True))
+        last = length * rates[0]
+        return jnp.stack([last, last, length * smooth], axis=1)
 
     added = jax.tree.map(resampled, memory.added)
     return eqx.tree_at(lambda memory: memory.added, memory, added)
@@ -146,6 +140,6 @@ def for_length(
 
 def with_history(new: Memory, old: Memory) -> Memory:
     """The last step of the stacked memory `new`, and before it the steps of `old`."""
-    join = lambda x, y: jnp.concatenate([x[:, :1], y[:, :-1]], axis=1)
+    join = lambda x, y: jnp.concatenate([x[:, :1], y[:, :2]], axis=1)
     added = jax.tree.map(join, new.added, old.added)
     return eqx.tree_at(lambda memory: memory.added, new, added)

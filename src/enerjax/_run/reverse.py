@@ -29,21 +29,24 @@ _FEWEST_LANES, _FEWEST_STEPS = 64, 20_000
 Body: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]
 
 
-class Bodies(NamedTuple):
-    """The body of a loop, and the one for lanes side by side, if there is one.
+class LoopBody(NamedTuple):
+    """What one pass of a loop computes, for one run and for the lanes of a batch.
 
-    - `has_failed(before, after)`: whether it has failed in passes between two carries.
+    - `in_turn`: for a single run, and for lanes that run one after the other.
+    - `side_by_side`: for lanes side by side; `None` if there is no such program.
+    - `has_failed(before, after)`: whether `side_by_side` has failed in the passes between
+      two carries.
     - `if_long`: see `SideBySide`.
     """
 
-    body: Body
+    in_turn: Body
     side_by_side: Body | None
     has_failed: Callable[[Any, Any], Flag]
     if_long: bool
 
 
-# `scan(bodies, carry, count, live)` calls `body(carry, live)` `count` times.
-Scan: TypeAlias = Callable[[Bodies, Any, int, Flag], tuple[Any, Any]]
+# `scan(body, carry, count, live)` makes `count` passes from `(carry, live)`.
+Scan: TypeAlias = Callable[[LoopBody, Any, int, Flag], tuple[Any, Any]]
 
 
 # XLA cannot merge a recomputation with the original across the passes of a loop.
@@ -72,15 +75,15 @@ def loops(
     return in_segments, _scan
 
 
-def _scan(bodies: Bodies, carry: Any, count: int, live: Flag) -> tuple[Any, Any]:
-    turn = lambda carry, _: bodies.body(carry, live)
-    return jax.lax.scan(turn, carry, None, length=count)
+def _scan(body: LoopBody, carry: Any, count: int, live: Flag) -> tuple[Any, Any]:
+    one_pass = lambda carry, _: body.in_turn(carry, live)
+    return jax.lax.scan(one_pass, carry, None, length=count)
 
 
 def _in_segments(
     total: int,
     length: int,
-    bodies: Bodies,
+    body: LoopBody,
     carry: Any,
     count: int,
     live: Flag,
@@ -96,23 +99,22 @@ def _in_segments(
 
     # Whether a pass is live is computed within its segment. An array of flags for all
     # passes would take more memory than the reverse pass of a long run keeps.
-    def passes(body: Body, carry: Any, inputs: tuple[Array, Flag]) -> tuple[Any, Any]:
+    def passes(fn: Body, carry: Any, inputs: tuple[Array, Flag]) -> tuple[Any, Any]:
         first, live = inputs
-        one_pass = lambda carry, k: body(carry, live & (first + k < count))
+        one_pass = lambda carry, k: fn(carry, live & (first + k < count))
         return jax.lax.scan(one_pass, carry, jnp.arange(size))
 
-    lanes = None
-    if bodies.side_by_side is not None:
-        body = bodies.side_by_side
+    lanes, for_lanes = None, body.side_by_side
+    if for_lanes is not None:
 
         def side_by_side(carry: Any, inputs: tuple[Array, Flag]) -> tuple[Any, Flag]:
-            out = passes(body, carry, inputs)
-            return out, bodies.has_failed(carry, out[0])
+            out = passes(for_lanes, carry, inputs)
+            return out, body.has_failed(carry, out[0])
 
         fewest = max(_FEWEST_LANES, -(-_FEWEST_STEPS // total))
-        lanes = SideBySide(side_by_side, fewest, bodies.if_long)
+        lanes = SideBySide(side_by_side, fewest, body.if_long)
 
-    whole = functools.partial(passes, bodies.body)
+    whole = functools.partial(passes, body.in_turn)
     segment = in_one_function(keep_roots(whole), lanes)
     if total > LONG:
         segment = _checkpoint(segment)

@@ -35,7 +35,7 @@ from ..schemes import (
     AbstractSchemeWithMemory,
     StepEnd,
 )
-from .prediction import extrapolated, LAST_STEPS, Memory, memory_after, predicted
+from .prediction import extrapolated, Memory, memory_after, predicted
 
 
 # Enough for the linear convergence of a step that locks. A step that needs more has failed.
@@ -87,7 +87,7 @@ def first_memory(
     problem = step_problem(scheme, model, start, h, carried)
     z = scheme.predict(problem, acceleration, multipliers)
     flight = free_flight(scheme, problem, model, start)
-    added = jax.tree.map(lambda x, x0: jnp.stack([x - x0] * LAST_STEPS), z, flight)
+    added = jax.tree.map(lambda x, x0: jnp.stack([x - x0] * 3), z, flight)
     added = jax.lax.stop_gradient(added)
     flat, _ = ravel_pytree(flight)
     has_chord = (
@@ -254,8 +254,7 @@ def _solved(
     branch = RESULTS.where(reverses, RESULTS.step_too_large, RESULTS.successful)
     found = from_root_finder(root.found, root.broken, root.finite)
     added = jax.lax.stop_gradient(jax.tree.map(jnp.subtract, z, prepared.flight))
-    before = jax.tree.map(lambda x: x[:3], memory.added)
-    sizes = model.scales.step, added, before, prepared.unknown_scale
+    sizes = model.scales.step, added, memory.added, prepared.unknown_scale
     return Solved(
         end=end,
         iterations=root.iterations,

@@ -17,12 +17,11 @@ import jax.numpy as jnp
 
 from .._operators import SeparableModel
 from .._programs import compiled_for_once, is_known, jacobian_pattern, structure_of
-from .._solvers import ChordAlone, Newton
+from .._solvers import ChordAlone
 from .._system import State, System
 from .._types import Scalar
-from ..schemes import AbstractSchemeWithChord
+from .loop import dispensable_newton
 from .step import model_for
-from .step_sizes import EqualPlan
 from .task import Task
 
 
@@ -47,15 +46,14 @@ class _Experience:
 
 def chord_alone(task: Task) -> Task | None:
     """The same run in a program without the exact Jacobian, if that is worth a try."""
-    newton, stage, system = task.root_finder, task.scheme.stage, task.system
-    if (
-        not (isinstance(newton, Newton) and newton.linear_solver is None)
-        or not (isinstance(stage, AbstractSchemeWithChord) and isinstance(system, System))
-        or not isinstance(task.plan, EqualPlan)
-        or task.watcher is not None
-        or system.redundant
-        or (system.constraint is None and system.driven is None)
-    ):
+    system = task.system
+    newton = dispensable_newton(
+        task.root_finder, task.scheme, task.plan, task.watcher, system
+    )
+    if newton is None:
+        return None
+    assert isinstance(system, System)
+    if system.constraint is None and system.driven is None:
         return None
     experience = _experience(task)
     if experience.needs_newton:

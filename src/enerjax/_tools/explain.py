@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from .._operators import AbstractModel, Increment, SeparableModel
 from .._programs import num_operations, simplified, why_not_one_function
 from .._run.inputs import prepare
-from .._run.loop import Stepper
+from .._run.loop import dispensable_newton, Stepper
 from .._run.stage import free_flight, is_chord_alone, step_problem
 from .._run.step import model_for
 from .._run.step_sizes import End, EqualSteps
@@ -107,9 +107,8 @@ def _explained(
     root_finder: RootFinder,
 ) -> Explanation:
     plan = EqualSteps().plan(scheme, h, jnp.zeros_like(h), End(num_steps=1))
-    search = root_finder
-    if isinstance(root_finder, Newton) and root_finder.linear_solver is None:
-        search = ChordAlone(root_finder)
+    dispensable = dispensable_newton(root_finder, scheme, plan, None, model.system)
+    search = root_finder if dispensable is None else ChordAlone(dispensable)
     stepper = Stepper(scheme, model, plan, search, None)
     begin = stepper.begin(start)
     memory = jax.tree.map(lambda x: x[0], begin.warm.stages)

@@ -43,12 +43,6 @@ class Frame(NamedTuple):
             return direction
         return jnp.sum(direction[:, None] * self.axes, axis=0)
 
-    def directions(self, directions: Float[Array, "n d"]) -> Float[Array, "n d"]:
-        """Several directions of the body in space."""
-        if self.axes is None:
-            return directions
-        return jnp.sum(directions[:, :, None] * self.axes[None], axis=1)
-
     def components(self, direction: Point) -> Point:
         """A direction in space, in the axes of the body."""
         if self.axes is None:

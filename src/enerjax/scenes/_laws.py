@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 from typing_extensions import TypeAliasType
@@ -71,12 +72,12 @@ class Alignment(AbstractConstraintLaw):
             return apart
         rows = [apart]
         if self.along is not None:
-            along = a.directions(_chosen(numbers["frame_a"], self.along))
+            along = jax.vmap(a.direction)(_chosen(numbers["frame_a"], self.along))
             rows = [jnp.sum(apart[None] * along, axis=1)]
         if self.square:
             i, j = zip(*self.square, strict=True)
-            of_a = a.directions(_chosen(numbers["frame_a"], i))
-            of_b = b.directions(_chosen(numbers["frame_b"], j))
+            of_a = jax.vmap(a.direction)(_chosen(numbers["frame_a"], i))
+            of_b = jax.vmap(b.direction)(_chosen(numbers["frame_b"], j))
             rows.append(jnp.sum(of_a * of_b, axis=1))
         return jnp.concatenate(rows)
 

@@ -57,19 +57,19 @@ def _parts(whole: Kernel) -> Iterator[Kernel]:
 def _while(loop: While, body: Plan, known: Values, size: int) -> list[Array]:
     before = [value_of(x, known, size) for x in loop.inputs]
 
-    def turn(carry: list[Array]) -> list[Array]:
+    def one_pass(carry: list[Array]) -> list[Array]:
         now = known | dict(zip([*loop.carry, loop.active], carry, strict=True))
         now = computed(body, now, size)
         return [value_of(x, now, size) for x in loop.outputs]
 
-    return jax.lax.while_loop(lambda carry: jnp.any(carry[-1]), turn, before)[:-1]
+    return jax.lax.while_loop(lambda carry: jnp.any(carry[-1]), one_pass, before)[:-1]
 
 
 def _scan(loop: Scan, body: Plan, known: Values, size: int) -> list[Array]:
     before = [value_of(x, known, size) for x in loop.before]
     rows = [_rows(column, known, size) for _, column in loop.rows]
 
-    def turn(carry: list[Array], row: list[Array]) -> tuple[list[Array], list[Array]]:
+    def one_pass(carry: list[Array], row: list[Array]) -> tuple[list[Array], list[Array]]:
         now = known | dict(zip(loop.carry, carry, strict=True))
         entries = (entry for entry, _ in loop.rows)
         now |= {x: jnp.broadcast_to(y, (size,)) for x, y in zip(entries, row, strict=True)}
@@ -78,7 +78,7 @@ def _scan(loop: Scan, body: Plan, known: Values, size: int) -> list[Array]:
         return out[: len(carry)], out[len(carry) :]
 
     carry, stacked = jax.lax.scan(
-        turn, before, rows, length=loop.length, reverse=loop.reverse
+        one_pass, before, rows, length=loop.length, reverse=loop.reverse
     )
     return [*carry, *stacked]
 

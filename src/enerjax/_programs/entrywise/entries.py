@@ -6,6 +6,7 @@ out, which removes most operations of a sparse system. So is a product with zero
 factor might be infinite or NaN: what multiplies a structural zero has no influence.
 """
 
+import functools
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeAlias
@@ -171,32 +172,21 @@ def _div(graph, operands, params, dtype):
     return graph.multiply(a, graph.number(lax.div_p, (one, b), params, dtype))
 
 
-def _neg(graph, operands, params, dtype):
+def _inverse_of_itself(name, graph, operands, params, dtype):
+    """An operation which, made twice, changes nothing."""
     (a,) = operands
-    return a.operands[0] if getattr(a.primitive, "name", "") == "neg" else None
+    return a.operands[0] if getattr(a.primitive, "name", "") == name else None
 
 
-def _and(graph, operands, params, dtype):
+def _logical(decides, graph, operands, params, dtype):
+    """`and`, which one operand `False` decides, and `or`, which `True` decides."""
     a, b = operands
     if dtype.kind != "b":
         return None
-    if _is(a, False) or _is(b, False):
-        return np.False_
-    return b if _is(a, True) or is_same(a, b) else a if _is(b, True) else None
-
-
-def _or(graph, operands, params, dtype):
-    a, b = operands
-    if dtype.kind != "b":
-        return None
-    if _is(a, True) or _is(b, True):
-        return np.True_
-    return b if _is(a, False) or is_same(a, b) else a if _is(b, False) else None
-
-
-def _not(graph, operands, params, dtype):
-    (a,) = operands
-    return a.operands[0] if getattr(a.primitive, "name", "") == "not" else None
+    if _is(a, decides) or _is(b, decides):
+        return np.bool_(decides)
+    other = not decides
+    return b if _is(a, other) or is_same(a, b) else a if _is(b, other) else None
 
 
 def _extreme(graph, operands, params, dtype):
@@ -228,16 +218,16 @@ def _square(graph, operands, params, dtype):
 _SIMPLER: dict[str, Callable[[Graph, Any, dict[str, Any], Any], Number | None]] = {
     "add": _add,
     "add_any": _add,
-    "and": _and,
+    "and": functools.partial(_logical, False),
     "convert_element_type": _convert,
     "div": _div,
     "integer_pow": _power,
     "max": _extreme,
     "min": _extreme,
     "mul": _mul,
-    "neg": _neg,
-    "not": _not,
-    "or": _or,
+    "neg": functools.partial(_inverse_of_itself, "neg"),
+    "not": functools.partial(_inverse_of_itself, "not"),
+    "or": functools.partial(_logical, True),
     "select_n": _select,
     "square": _square,
     "sub": _sub,
