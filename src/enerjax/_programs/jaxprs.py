@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jax.extend import source_info_util
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
-from .primitives import CALLS, JIT, WITH_OWN_DERIVATIVE
+from .primitives import CALLS, JIT, LINEAR_SOLVE, WITH_OWN_DERIVATIVE
 
 
 def is_known(tree: Any) -> bool:
@@ -109,8 +109,14 @@ _TRUSTED = Path(jax.__file__).parent, Path(__file__).parents[1]
 
 
 def programs_within(equation: Any) -> Iterator[Jaxpr]:
-    """All programs among the parameters of an equation: bodies, branches, wrapped ones."""
-    yield from _programs(equation.params.values())
+    """All programs that an equation runs: bodies, branches, wrapped ones.
+
+    Of those of a linear solve it runs one, the solution.
+    """
+    params = equation.params
+    if equation.primitive.name == LINEAR_SOLVE:
+        params = dict(program=params["jaxprs"].solve)
+    yield from _programs(params.values())
 
 
 def _programs(params: Any) -> Iterator[Jaxpr]:

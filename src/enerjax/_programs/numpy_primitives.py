@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from .jaxprs import evaluate
+from .jaxprs import evaluate, interpret
+from .primitives import JIT
 
 
 def _broadcast_in_dim(x, *, shape, broadcast_dimensions, **_):
@@ -168,4 +169,9 @@ def evaluated(primitive: Any, values: list[Any], params: dict[str, Any]) -> list
         return [np.asarray(values[0]).astype(params["new_dtype"])]
     if name in _FUNCTIONS:
         return [np.asarray(_FUNCTIONS[name](*map(np.asarray, values)))]
+    if name in JIT:
+        program, consts = params["jaxpr"].jaxpr, params["jaxpr"].consts
+        return interpret(
+            program, consts, values, lambda eqn, x: evaluated(eqn.primitive, x, eqn.params)
+        )
     return evaluate(primitive, values, params)

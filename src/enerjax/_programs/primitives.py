@@ -84,5 +84,7 @@ CALLS = {
 }
 # Wrappers that exist only in versions of JAX without the marks of one function.
 CALLS_OF_OTHER_VERSIONS = _names("checkpoint core_call pjit")
+# A linear solve, with programs for the products and the solutions of both directions.
+LINEAR_SOLVE = "custom_linear_solve"
 # Loops and branches.
 CONTROL_FLOW = _names("cond scan while")

@@ -17,6 +17,7 @@ from jaxtyping import Array, PyTree
 
 from .compiled import is_hashable
 from .jaxprs import evaluate, interpret, known_numbers
+from .numpy_primitives import evaluated
 
 
 # Constants with more numbers than this are not compared.
@@ -82,12 +83,32 @@ class _Once:
         if id(equation) not in self._needed:
             return [None] * len(equation.outvars)
         primitive, params = equation.primitive, equation.params
+        indices = _indices(equation, values)
+        if indices is not None:
+            return indices
         key = primitive, tuple(params.items()), tuple(map(_identity, values))
         if equation.effects or not is_hashable(key):
             return evaluate(primitive, values, params)
         if key not in self._found:
             self._found[key] = evaluate(primitive, values, params), values
         return self._found[key][0]
+
+
+def _indices(equation: Any, values: list[Any]) -> list[Any] | None:
+    """The outputs of an equation that computes indices, if its inputs are known."""
+    avals = [x.aval for x in equation.outvars]
+    if any(not _is_index(x) or x.size > _MANY for x in avals):
+        return None
+    known = [known_numbers(x) for x in values]
+    if any(x is None for x in known) or equation.effects:
+        return None
+    with jax.ensure_compile_time_eval():
+        out = evaluated(equation.primitive, known, equation.params)
+    return [np.asarray(x, aval.dtype) for x, aval in zip(out, avals, strict=True)]
+
+
+def _is_index(aval: Any) -> bool:
+    return getattr(aval.dtype, "kind", "key") in "iub"
 
 
 def _identity(value: Any) -> Any:

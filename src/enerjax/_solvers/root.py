@@ -15,15 +15,17 @@ from jax.ad_checkpoint import checkpoint_name
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from .._programs import in_one_function, is_known, simplified
+from .._programs import in_one_function, is_known, part, simplified
 from .._types import Flag, Scalar
 from .linear.dense import AbstractFactors
 from .linear.jacobian import Linearisable
+from .linear.krylov import solver_by_products
 from .newton import ChordAlone, Start
 from .root_finding import (
     Chord,
     flat_of,
     flattened,
+    has_chord_search,
     Root,
     RootFinder,
     search,
@@ -58,16 +60,47 @@ def _root_jvp(primals, tangents):
     unmoved = jax.tree.map(is_none, t_args, is_leaf=is_none)
     fixed, moved = eqx.partition(args, unmoved, is_leaf=is_none)
     flat, unravel, flat_fn = flattened(fn, root.value)
-    by_args = lambda moved: flat_fn(flat, eqx.combine(moved, fixed))
+    by_args = part(lambda moved: flat_fn(flat, eqx.combine(moved, fixed)))
     _, rate = jax.jvp(by_args, (moved,), (t_args,))
     regularisation = flat_of(args[-1])
-    linear = with_jacobian(flat_fn, flat, args, root_finder, regularisation, start, chord)
-    change = linear.solve(flat, -rate)
+    exact = with_jacobian(flat_fn, flat, args, root_finder, regularisation, start, chord)
     if regularisation is not None:
-        change = change + _null_space_rate(linear, flat_fn, flat, (moved, fixed), t_args)
+        change = exact.solve(flat, -rate)
+        change = change + _null_space_rate(exact, flat_fn, flat, (moved, fixed), t_args)
+    elif chord is not None and has_chord_search(root_finder):
+        change = _change(exact, chord, root_finder, root, args, -rate)
+    else:
+        change = exact.solve(flat, -rate)
     # Only the value of the root is differentiated. Its statistics have zero tangents.
     still = jax.tree.map(jnp.zeros_like, eqx.filter(root, eqx.is_inexact_array))
     return root, eqx.tree_at(lambda root: root.value, still, unravel(change))
+
+
+# Up to this number of unknowns conjugate residuals end in any case.
+_FEW = 64
+
+
+def _change(
+    exact: Linearisable,
+    chord: Chord,
+    root_finder: RootFinder | ChordAlone,
+    root: Root,
+    args: PyTree,
+    right: Float[Array, " n"],
+) -> Float[Array, " n"]:
+    """The rate of change of a root that the chord method may have found.
+
+    Where it has, the approximate Jacobian is close to the exact one, and a few products
+    with the latter are cheaper than its entries.
+    """
+    flat, unravel = ravel_pytree(root.value)
+    prepared = part(lambda: chord.prepare(root.value, args))()
+    correct = lambda x: ravel_pytree(chord.correct(unravel(x), args, prepared))[0]
+    by_products = solver_by_products(exact.value, flat, correct)
+    if isinstance(root_finder, ChordAlone) or flat.size <= _FEW:
+        return by_products(right)
+    by_entries = lambda right: exact.solve(flat, right)
+    return jax.lax.cond(root.by_chord, by_products, by_entries, right)
 
 
 def _null_space_rate(

@@ -94,6 +94,16 @@ def with_jacobian(
     )
 
 
+def has_chord_search(root_finder: RootFinder | ChordAlone) -> bool:
+    """Whether searches with this root finder begin with the chord method, if there is one.
+
+    A solver of the user must see all equations.
+    """
+    if isinstance(root_finder, ChordAlone):
+        return True
+    return isinstance(root_finder, Newton) and root_finder.linear_solver is None
+
+
 def search(
     fn: Callable[[PyTree[Array], Any], PyTree[Array]],
     chord: Chord | None,
@@ -131,7 +141,7 @@ def search(
     flat, _, flat_fn = flattened(fn, start.guess)
     regularisation = flat_of(start.regularisation)
     exact = with_jacobian(flat_fn, flat, args, root_finder, regularisation, start, chord)
-    if chord is None or root_finder.linear_solver is not None:
+    if chord is None or not has_chord_search(root_finder):
         return _iterated(exact, root_finder, start, max_iterations)
     first = _by_chord(fn, chord, root_finder, args, start)
 

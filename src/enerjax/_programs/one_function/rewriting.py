@@ -22,7 +22,7 @@ from jaxtyping import Array, Int
 
 from ..jaxprs import evaluate, interpret, programs_within, wrapped_program
 from ..numpy_primitives import evaluated
-from ..primitives import CONTRACTION, SCATTERS
+from ..primitives import CONTRACTION, LINEAR_SOLVE, SCATTERS
 from .possible import is_part, is_small_product, LARGEST_SUM, NAME
 from .products import written_out
 
@@ -62,6 +62,8 @@ def _equation(eqn: Any, values: list[Any]) -> list[Any]:
             program = params["program"]
             count = len(program.jaxpr.constvars)
             return interpret(program.jaxpr, values[:count], values[count:], _equation)
+        if name == LINEAR_SOLVE:
+            return _solved(values, params)
         if name == CONTRACTION and eqn.outvars[0].aval.size <= LARGEST_SUM:
             left, right = values
             return [written_out(left, right, params["dimension_numbers"])]
@@ -92,7 +94,7 @@ def _must_be_replaced(eqn: Any) -> bool:
         return eqn.invars[0].aval.size > LARGEST_SUM
     if is_part(eqn):
         return True
-    return name in SCATTERS or (name == CONTRACTION and not is_small_product(eqn))
+    return name in (*SCATTERS, LINEAR_SOLVE) or (name == CONTRACTION and not is_small_product(eqn))
 
 
 def _needs_rewriting(jaxpr: Any) -> bool:
@@ -101,6 +103,15 @@ def _needs_rewriting(jaxpr: Any) -> bool:
         for eqn in jaxpr.eqns
         if is_part(eqn) or eqn.primitive.name != NAME
     )
+
+
+def _solved(values: list[Any], params: dict[str, Any]) -> list[Any]:
+    """The solution that `jax.lax.custom_linear_solve` finds, without its derivatives."""
+    counts, program = params["const_lengths"], params["jaxprs"].solve
+    first = counts.matvec + counts.vecmat
+    consts = values[first : first + counts.solve]
+    right = values[sum(counts) :]
+    return interpret(program.jaxpr, program.consts, [*consts, *right], _equation)
 
 
 # Loops and branches -----------------------------------------------------------------------
@@ -225,7 +236,7 @@ def _reduced(primitive: Any, x: Array, params: dict[str, Any]) -> Array:
 
 
 # Primitives that this module replaces, where their indices are known and sizes allow it.
-REWRITTEN = SCATTERS | _OF_PAIRS.keys() | {CONTRACTION}
+REWRITTEN = SCATTERS | _OF_PAIRS.keys() | {CONTRACTION, LINEAR_SOLVE}
 
 
 def _picked(flat: Array, source: Array | np.ndarray, shape: tuple[int, ...]) -> Array:

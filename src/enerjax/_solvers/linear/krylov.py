@@ -1,0 +1,108 @@
+"""Linear equations with a matrix that is known by its products, and nearly inverted.
+
+The method of generalised conjugate residuals (S. C. Eisenstat, H. C. Elman and M. H.
+Schultz, SIAM Journal on Numerical Analysis 20, 1983) with an approximate inverse.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..._programs import part
+from ..._types import Count
+
+
+Vector = Float[Array, " n"]
+Map = Callable[[Vector], Vector]
+
+# More directions are not kept. With an approximate inverse by which errors shrink to a half,
+# fifty reach round-off.
+_MOST = 64
+
+
+class _Search(NamedTuple):
+    """The state of the iterations.
+
+    - `x`, `left`: the solution so far, and its residual.
+    - `directions`, `images`: those of the corrections so far, and their products with the
+      matrix, which are orthonormal. Rows that are not yet used are zero.
+    - `count`: the number of corrections.
+    """
+
+    x: Vector
+    left: Vector
+    directions: Float[Array, "most n"]
+    images: Float[Array, "most n"]
+    count: Count
+
+
+def solve_by_products(product: Map, approximate: Map, right: Vector) -> Vector:
+    """The solution `x` of `product(x) = right`, where `approximate` nearly inverts it.
+
+    It is NaN if the equations are not solved to half of the digits.
+    """
+    most, eps = min(right.size, _MOST), jnp.finfo(right.dtype).eps
+    norm = lambda x: jnp.sqrt(jnp.sum(x * x))
+    put = jax.lax.dynamic_update_index_in_dim
+    size = norm(right)
+
+    def correct(search: _Search) -> _Search:
+        x, left, directions, images, count = search
+        direction = approximate(left)
+        image = product(direction)
+
+        def orthogonal(k: Count, pair: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+            image, direction = pair
+            share = jnp.sum(images[k] * image)
+            return image - share * images[k], direction - share * directions[k]
+
+        # The second pass removes what cancellation leaves in the first.
+        for _ in range(2):
+            pair = image, direction
+            image, direction = jax.lax.fori_loop(0, count, orthogonal, pair)
+        length = norm(image)
+        unit = jnp.where(length > 0, 1 / length, 0)
+        image, direction = unit * image, unit * direction
+        share = jnp.sum(image * left)
+        return _Search(
+            x=x + share * direction,
+            left=left - share * image,
+            directions=put(directions, direction, count, 0),
+            images=put(images, image, count, 0),
+            count=count + 1,
+        )
+
+    none = jnp.zeros((most, right.size), right.dtype)
+    first = _Search(jnp.zeros_like(right), right, none, none, jnp.array(0))
+    goes_on = lambda c: (norm(c.left) > 8 * eps * size) & (c.count < most)
+    last = jax.lax.while_loop(goes_on, correct, first)
+    return jnp.where(norm(last.left) <= eps**0.5 * size, last.x, jnp.nan)
+
+
+def solver_by_products(
+    fn: Map, x: Vector, approximate: Map
+) -> Callable[[Vector], Vector]:
+    """A function that solves with the Jacobian of `fn` at `x`, and can be transposed.
+
+    `approximate` nearly inverts the Jacobian; its derivatives are not needed.
+    """
+
+    def solve(_: Map, right: Vector) -> Vector:
+        _, product = jax.linearize(fn, x)
+        return solve_by_products(product, approximate, right)
+
+    def solve_transposed(_: Map, right: Vector) -> Vector:
+        _, product = jax.vjp(fn, x)
+        _, nearly = jax.vjp(approximate, right)
+        return solve_by_products(lambda y: product(y)[0], lambda y: nearly(y)[0], right)
+
+    def product(t: Vector) -> Vector:
+        return jax.jvp(fn, (x,), (t,))[1]
+
+    inside = lambda solve: lambda _, right: part(lambda right: solve(_, right))(right)
+    return lambda right: jax.lax.custom_linear_solve(
+        product, right, inside(solve), inside(solve_transposed)
+    )
