@@ -17,6 +17,7 @@ from enerjax._run import without_jacobian
 from enerjax._run.prediction import extrapolated
 from enerjax._solvers import Chord, find_root, Newton, schur, schur_tables
 from enerjax._solvers.linear.block_diagonal import in_blocks
+from enerjax._solvers.linear.krylov import solver_by_products
 
 from .helpers import EPS, SCHEMES
 
@@ -165,7 +166,7 @@ def test_redundant_coordinates_take_one_correction_too(name):
 
 # The search -------------------------------------------------------------------------------
 
-ARGS = jnp.cos(jnp.arange(float(SIZE)))
+ARGS, MANY = (jnp.cos(jnp.arange(float(size))) for size in (SIZE, 3 * SIZE))
 
 
 def _equations(x, inputs):
@@ -183,7 +184,7 @@ def _root(strength, args, guess, chord=CHORD):
 
 
 @pytest.mark.parametrize(("strength", "by_chord"), [(1e-3, True), (0.1, True), (30, False)])
-def test_a_root_and_its_derivatives_do_not_depend_on_the_chord(strength, by_chord):
+def test_a_root_does_not_depend_on_the_chord(strength, by_chord):
     """Neither where the chord iteration is quick, nor where Newton's method must follow."""
     guess = jnp.zeros(SIZE)
     root = _root(strength, ARGS, guess)
@@ -191,9 +192,30 @@ def test_a_root_and_its_derivatives_do_not_depend_on_the_chord(strength, by_chor
     assert root.by_chord == by_chord
     rest = _equations(root.value, (strength, ARGS))
     assert jnp.max(jnp.abs(rest)) <= 100 * (1 + strength) * EPS  # round-off
-    found, change = jax.jvp(lambda a: _root(strength, a, guess).value, (ARGS,), (ARGS,))
-    jacobian = jax.jacfwd(_equations)(found, (strength, ARGS))
-    np.testing.assert_allclose(change, np.linalg.solve(jacobian, ARGS), rtol=1e-9)
+
+
+@pytest.mark.parametrize("args", [ARGS, MANY], ids=["few", "many"])
+@pytest.mark.parametrize("strength", [1e-3, 0.1, 30])
+def test_the_derivatives_of_a_root_are_exact(strength, args):
+    """By products with the Jacobian where the chord is close to it, else by its entries."""
+    value = lambda a: _root(strength, a, jnp.zeros_like(args)).value
+    found, change = jax.jvp(value, (args,), (args,))
+    jacobian = jax.jacfwd(_equations)(found, (strength, args))
+    # Round-off, by the condition of the Jacobian.
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-10, atol=1e-12)
+    close(change, np.linalg.solve(jacobian, args))
+    _, pull = jax.vjp(value, args)
+    for scale in (1.0, 1e-250, 1e250):
+        (pulled,) = pull(scale * args)
+        close(pulled / scale, np.linalg.solve(jacobian.T, args))
+
+
+def test_a_chord_that_misleads_gives_no_wrong_derivative():
+    """It ignores half of the unknowns, so its corrections do not reach the solution."""
+    half = jnp.arange(SIZE) < SIZE // 2
+    solver = solver_by_products(lambda x: 2 * x, ARGS, lambda x: jnp.where(half, x, 0))
+    assert jnp.all(jnp.isnan(solver(ARGS)))
+    np.testing.assert_array_equal(solver(jnp.zeros(SIZE)), 0)
 
 
 def test_lanes_that_need_newton_do_not_affect_others():
@@ -315,8 +337,10 @@ def test_stiff_forces_are_noticed_before_the_first_program(searched_by, damped):
     assert searched_by == ["Newton"]
 
 
-@pytest.mark.parametrize("transform", [jax.vmap, jax.grad], ids=["vmap", "grad"])
-def test_a_traced_number_in_a_closure_is_noticed(searched_by, transform):
+@pytest.mark.parametrize(
+    ("transform", "finder"), [(jax.vmap, "Newton"), (jax.grad, "ChordAlone")]
+)
+def test_a_traced_number_in_a_closure_is_noticed(searched_by, transform, finder):
     def run(length):
         system = ej.System(
             jnp.eye(2),
@@ -329,7 +353,23 @@ def test_a_traced_number_in_a_closure_is_noticed(searched_by, transform):
 
     found = transform(run)(jnp.array([1.0, 2.0]) if transform is jax.vmap else 1.0)
     assert jnp.all(jnp.isfinite(found))
-    assert set(searched_by) == {"Newton"}
+    assert set(searched_by) == {finder}
+
+
+@pytest.mark.parametrize(("h", "finders"), [(2e-3, 1), (0.01, 2)])
+def test_derivatives_alone_do_not_need_newton_either(searched_by, h, finders):
+    """Outside of `jit` it is known whether the run of a derivative has failed."""
+    system, start, args = ej.problems.chain(8)
+
+    def end(h):
+        sol = ej.simulate(system, ej.EnergyPreserving(), start, args, h=h, num_steps=60)
+        return sol.ys.q[-1, -1]
+
+    slope = jax.grad(end)(h)
+    assert searched_by == ["ChordAlone", "Newton"][:finders]
+    together = jax.jit(lambda h: jax.jvp(end, (h,), (1.0,))[1])(h)
+    # Solver: round-off, grown over 60 steps.
+    np.testing.assert_allclose(slope, together, rtol=1e-9)
 
 
 def test_a_failure_that_newton_cannot_mend_is_made_once(searched_by):

@@ -9,6 +9,7 @@ from .compiled import (
     once_per_structure as once_per_structure,
     Readable as Readable,
     structure_of as structure_of,
+    values_of as values_of,
 )
 from .counting import num_operations as num_operations
 from .digest import checksum as checksum, digest as digest

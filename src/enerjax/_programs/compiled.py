@@ -6,6 +6,7 @@ from typing import Any, ParamSpec, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr
@@ -155,6 +156,16 @@ def at_top_level(arguments: PyTree[Any]) -> bool:
     A traced value in the closure of a function among them is not noticed.
     """
     return is_known(arguments) and not isinstance(_zero(), Tracer)
+
+
+def values_of(tree: PyTree[Any]) -> PyTree[Any]:
+    """The tree without derivatives.
+
+    Its numbers are known in a call inside of `jax.grad` and `jax.jvp`, if these are not
+    inside of other transformations themselves.
+    """
+    still = lambda x: jnp.asarray(jax.lax.stop_gradient(x)) if eqx.is_array(x) else x
+    return jax.tree.map(still, tree)
 
 
 @functools.cache

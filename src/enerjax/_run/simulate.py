@@ -5,7 +5,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from .._programs import at_top_level, compiled
+from .._programs import at_top_level, compiled, is_known, values_of
 from .._progress import Progress
 from .._results import may_need_newton, RESULTS
 from .._solvers import Newton, RootFinder
@@ -170,16 +170,17 @@ def simulate(
 def _whole(task: Task, num_rows: int) -> tuple[Solution, Scalar]:
     """A run in one piece, and the time that it has reached."""
     quick = None
-    if at_top_level(task):
+    values = values_of(task)
+    if at_top_level(values):
         task = dataclasses.replace(task, may_have_lanes=False)
-        if task.watcher is None:
+        if task.watcher is None and is_known(task):
             task = dataclasses.replace(task, plan=task.plan.rounded_up())
-        quick = chord_alone(task)
+        quick = chord_alone(task, values)
     solution, reached, alone = _run(task if quick is None else quick)
-    if alone and bool(may_need_newton(solution.result)):
+    if alone and bool(may_need_newton(values_of(solution.result))):
         solution, reached, _ = _run(task)
-        if bool(solution.result == RESULTS.successful):
-            remember_newton(task)
+        if bool(values_of(solution.result) == RESULTS.successful):
+            remember_newton(values)
     if solution.ts.size > num_rows:
         solution = first_rows(solution, num_rows)
     return solution, reached

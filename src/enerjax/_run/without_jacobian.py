@@ -16,7 +16,13 @@ import jax
 import jax.numpy as jnp
 
 from .._operators import SeparableModel
-from .._programs import compiled_for_once, is_known, jacobian_pattern, structure_of
+from .._programs import (
+    compiled_for_once,
+    is_known,
+    jacobian_pattern,
+    structure_of,
+    values_of,
+)
 from .._solvers import ChordAlone
 from .._system import State, System
 from .._types import Scalar
@@ -44,27 +50,32 @@ class _Experience:
     needs_newton: bool = False
 
 
-def chord_alone(task: Task) -> Task | None:
-    """The same run in a program without the exact Jacobian, if that is worth a try."""
-    system = task.system
+def chord_alone(task: Task, values: Task) -> Task | None:
+    """The same run in a program without the exact Jacobian, if that is worth a try.
+
+    `values` is the task without derivatives.
+    """
+    system = values.system
     newton = dispensable_newton(
-        task.root_finder, task.scheme, task.plan, task.watcher, system
+        values.root_finder, values.scheme, values.plan, values.watcher, system
     )
     if newton is None:
         return None
     assert isinstance(system, System)
     if system.constraint is None and system.driven is None:
         return None
-    experience = _experience(task)
+    experience = _experience(values)
     if experience.needs_newton:
         return None
     if experience.is_linear is None:
-        if _closes_over_traced_values(system, task):
+        if _closes_over_unknown_values(system, values):
             return None
-        experience.is_linear = _is_linear(system, task)
+        experience.is_linear = _is_linear(system, values)
     # NaN compares false: such a run fails in any program.
-    if not experience.is_linear and bool(_contraction(task) > _CONTRACTS):
-        return None
+    if not experience.is_linear:
+        contraction = values_of(_contraction(values))
+        if bool(contraction > _CONTRACTS):
+            return None
     return dataclasses.replace(task, root_finder=ChordAlone(newton))
 
 
@@ -83,15 +94,15 @@ def _remembered(structure: Hashable) -> _Experience:
     return _Experience()
 
 
-def _closes_over_traced_values(system: System, task: Task) -> bool:
-    """Whether a function of the system has a traced value in its closure.
+def _closes_over_unknown_values(system: System, task: Task) -> bool:
+    """Whether a function of the system has a value in its closure that is not known now.
 
     The result of such a run is traced, so it cannot be known whether the run has failed.
     """
     start, args = task.start, task.args
     t = jnp.zeros((), start.q.dtype)
 
-    def values(q: jax.Array, v: jax.Array) -> Any:
+    def found_by(q: jax.Array, v: jax.Array) -> Any:
         found = [system.kinetic_energy(State(q, v), args), system.potential(q, args)]
         if system.constraint is not None:
             found.append(system.constraint(q, args))
@@ -103,7 +114,7 @@ def _closes_over_traced_values(system: System, task: Task) -> bool:
             found.append(system.nonholonomic(q, args))
         return found
 
-    return not is_known(jax.make_jaxpr(values)(start.q, start.v).consts)
+    return not is_known(values_of(jax.make_jaxpr(found_by)(start.q, start.v).consts))
 
 
 def _is_linear(system: System, task: Task) -> bool:

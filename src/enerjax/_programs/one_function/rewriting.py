@@ -94,7 +94,9 @@ def _must_be_replaced(eqn: Any) -> bool:
         return eqn.invars[0].aval.size > LARGEST_SUM
     if is_part(eqn):
         return True
-    return name in (*SCATTERS, LINEAR_SOLVE) or (name == CONTRACTION and not is_small_product(eqn))
+    return name in (*SCATTERS, LINEAR_SOLVE) or (
+        name == CONTRACTION and not is_small_product(eqn)
+    )
 
 
 def _needs_rewriting(jaxpr: Any) -> bool:

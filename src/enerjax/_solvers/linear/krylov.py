@@ -18,8 +18,8 @@ from ..._types import Count
 Vector = Float[Array, " n"]
 Map = Callable[[Vector], Vector]
 
-# More directions are not kept. With an approximate inverse by which errors shrink to a half,
-# fifty reach round-off.
+# More directions are not kept. With an approximate inverse by which errors shrink to a
+# half, fifty reach round-off.
 _MOST = 64
 
 
@@ -42,11 +42,15 @@ class _Search(NamedTuple):
 def solve_by_products(product: Map, approximate: Map, right: Vector) -> Vector:
     """The solution `x` of `product(x) = right`, where `approximate` nearly inverts it.
 
-    It is NaN if the equations are not solved to half of the digits.
+    It is NaN if the residual has not decreased by three quarters of the digits.
     """
     most, eps = min(right.size, _MOST), jnp.finfo(right.dtype).eps
     norm = lambda x: jnp.sqrt(jnp.sum(x * x))
     put = jax.lax.dynamic_update_index_in_dim
+    # The squares of extreme numbers would overflow or vanish.
+    largest = jnp.max(jnp.abs(right), initial=0.0)
+    unit = jnp.where(largest > 0, largest, 1.0)
+    right = right / unit
     size = norm(right)
 
     def correct(search: _Search) -> _Search:
@@ -64,8 +68,8 @@ def solve_by_products(product: Map, approximate: Map, right: Vector) -> Vector:
             pair = image, direction
             image, direction = jax.lax.fori_loop(0, count, orthogonal, pair)
         length = norm(image)
-        unit = jnp.where(length > 0, 1 / length, 0)
-        image, direction = unit * image, unit * direction
+        scale = jnp.where(length > 0, 1 / length, 0)
+        image, direction = scale * image, scale * direction
         share = jnp.sum(image * left)
         return _Search(
             x=x + share * direction,
@@ -79,12 +83,10 @@ def solve_by_products(product: Map, approximate: Map, right: Vector) -> Vector:
     first = _Search(jnp.zeros_like(right), right, none, none, jnp.array(0))
     goes_on = lambda c: (norm(c.left) > 8 * eps * size) & (c.count < most)
     last = jax.lax.while_loop(goes_on, correct, first)
-    return jnp.where(norm(last.left) <= eps**0.5 * size, last.x, jnp.nan)
+    return jnp.where(norm(last.left) <= eps**0.75 * size, unit * last.x, jnp.nan)
 
 
-def solver_by_products(
-    fn: Map, x: Vector, approximate: Map
-) -> Callable[[Vector], Vector]:
+def solver_by_products(fn: Map, x: Vector, approximate: Map) -> Callable[[Vector], Vector]:
     """A function that solves with the Jacobian of `fn` at `x`, and can be transposed.
 
     `approximate` nearly inverts the Jacobian; its derivatives are not needed.
