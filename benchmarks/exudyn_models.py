@@ -67,6 +67,8 @@ class Model:
         if self.redundant:
             settings.linearSolver.solverType = kinds.EigenDense
             settings.linearSolver.ignoreSingularJacobian = True
+        # Steps that fail are divided, but not for ever.
+        settings.timeIntegration.minimumStepSize = h / 100
         settings.parallel.numberOfThreads = 1
         return settings
 
