@@ -136,13 +136,15 @@ def _distance(end: Any, reference: Any) -> float | None:
     """The largest difference of positions; NaN of a failed run."""
     if end is None or reference is None:
         return None
-    one, other = _own_axes(end), _own_axes(reference)
+    one, other = np.asarray(end), np.asarray(reference)
+    if one.shape != other.shape:
+        # One program is in the plane, the other in space.
+        one, other = _own_axes(one), _own_axes(other)
     return float(np.max(np.abs(one - other)))
 
 
-def _own_axes(positions: Any) -> np.ndarray:
+def _own_axes(positions: np.ndarray) -> np.ndarray:
     """Without the axes of space that a motion in a plane does not use."""
-    positions = np.asarray(positions)
     return positions[:, np.any(np.abs(positions) > 1e-9, axis=0) | np.isnan(positions[0])]
 
 

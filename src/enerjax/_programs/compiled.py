@@ -88,20 +88,23 @@ class Readable:
 
 
 def once_per_structure(check: Callable[..., None]) -> Callable[..., None]:
-    """A check of shapes and types that is not repeated for arguments of the same structure.
+    """A check of functions that is not repeated for arguments of the same structure.
 
     To trace the functions of a user takes milliseconds, which would be most of a short run.
     Inside of transformations every call checks.
     """
 
     @functools.lru_cache(maxsize=128)
-    def of_structure(structure: _Structure) -> None:
-        check(*_joined(*structure))
+    def memory(structure: _Structure) -> list[str]:
+        return []
 
     @functools.wraps(check)
     def call(*args: Any) -> None:
         structure = structure_of(args) if at_top_level(args) else None
-        return check(*args) if structure is None else of_structure(structure)
+        passed = [] if structure is None else memory(structure)
+        if not passed:
+            check(*args)
+            passed.append("passed")
 
     return call
 
@@ -164,6 +167,8 @@ def values_of(tree: PyTree[Any]) -> PyTree[Any]:
     Its numbers are known in a call inside of `jax.grad` and `jax.jvp`, if these are not
     inside of other transformations themselves.
     """
+    if is_known(tree):
+        return tree
     still = lambda x: jnp.asarray(jax.lax.stop_gradient(x)) if eqx.is_array(x) else x
     return jax.tree.map(still, tree)
 

@@ -12,24 +12,25 @@ from .._analysis import mobility
 from .._programs import is_known
 from .._results import RESULTS
 from .._system import AbstractSystem
-from .._types import Args, Scalar
+from .._types import Args, Flag, Scalar
 from .solution import Solution
 
 
 def raise_failure(
     solution: Solution,
+    failed: Flag,
     system: AbstractSystem,
     args: Args,
     reached: Scalar,
     h: Scalar | None = None,
 ) -> Solution:
-    """The solution of a successful run; else an error with step, time, cause and remedy.
+    """The solution of a run that has not failed; else an error with step, time, cause and
+    remedy.
 
     `reached` is the time that the run has reached, `h` the length of its steps if all have
     the same.
     """
-    failed = solution.result != RESULTS.successful
-    if not is_known((solution, args, reached, h)):
+    if not is_known((solution, failed, args, reached, h)):
         return solution.result.error_if(solution, failed)
     if not failed:
         return solution

@@ -4,13 +4,14 @@ import dataclasses
 import os
 import sys
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from .._programs import at_top_level, compiled, is_known, values_of
 from .._progress import Progress
 from .._results import may_need_newton, RESULTS
 from .._solvers import Newton, RootFinder
 from .._system import AbstractSystem, State
-from .._types import Args, Real, Scalar
+from .._types import Args, Flag, Real, Scalar
 from ..schemes import AbstractScheme
 from .events import AbstractEvent
 from .failure import explained_memory_error, raise_failure
@@ -158,17 +159,30 @@ def simulate(
     num_rows = task.saving.num_rows(plan)
     with explained_memory_error(plan.max_attempts):
         if options is None:
-            solution, reached = _whole(task, num_rows)
+            solution, outcome = _whole(task, num_rows)
+            reached, failed = outcome.reached, outcome.failed
         else:
             solution, reached = run_long(task, num_rows, options)
+            failed = solution.result != RESULTS.successful
     if not throw:
         return solution
     equal = plan.unit if isinstance(controller, EqualSteps) else None
-    return raise_failure(solution, system, args, reached, equal)
+    return raise_failure(solution, failed, system, args, reached, equal)
 
 
-def _whole(task: Task, num_rows: int) -> tuple[Solution, Scalar]:
-    """A run in one piece, and the time that it has reached."""
+class _Outcome(NamedTuple):
+    """How a run has ended: the time that it has reached, and whether it has failed.
+
+    - `needs_newton`: whether it may have failed for want of Newton's method.
+    """
+
+    reached: Scalar
+    failed: Flag
+    needs_newton: Flag
+
+
+def _whole(task: Task, num_rows: int) -> tuple[Solution, _Outcome]:
+    """A run in one piece."""
     quick = None
     values = values_of(task)
     if at_top_level(values):
@@ -176,18 +190,18 @@ def _whole(task: Task, num_rows: int) -> tuple[Solution, Scalar]:
         if task.watcher is None and is_known(task):
             task = dataclasses.replace(task, plan=task.plan.rounded_up())
         quick = chord_alone(task, values)
-    solution, reached, alone = _run(task if quick is None else quick)
-    if alone and bool(may_need_newton(values_of(solution.result))):
-        solution, reached, _ = _run(task)
-        if bool(values_of(solution.result) == RESULTS.successful):
+    solution, outcome, alone = _run(task if quick is None else quick)
+    if alone and values_of(outcome).needs_newton:
+        solution, outcome, _ = _run(task)
+        if not values_of(outcome).failed:
             remember_newton(values)
     if solution.ts.size > num_rows:
         solution = first_rows(solution, num_rows)
-    return solution, reached
+    return solution, outcome
 
 
 @compiled
-def _run(task: Task) -> tuple[Solution, Scalar, bool]:
+def _run(task: Task) -> tuple[Solution, _Outcome, bool]:
     """The program of a run in one piece; also whether it leaves out the exact Jacobian."""
     plan, saving, stepper = task.plan, task.saving, task.stepper()
     model = stepper.model
@@ -204,5 +218,9 @@ def _run(task: Task) -> tuple[Solution, Scalar, bool]:
     rows = saving.rows(run)
     happened = task.events(model, record, rows.multipliers)
     solution = dataclasses.replace(task.solution(model, rows, end), events=happened)
-    alone = is_chord_alone(task.root_finder, end.warm.stages)
-    return solution, plan.time(end.place), alone
+    outcome = _Outcome(
+        reached=plan.time(end.place),
+        failed=end.result != RESULTS.successful,
+        needs_newton=may_need_newton(end.result),
+    )
+    return solution, outcome, is_chord_alone(task.root_finder, end.warm.stages)

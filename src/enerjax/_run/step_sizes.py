@@ -269,7 +269,11 @@ class EqualPlan(AbstractPlan):
         return dataclasses.replace(self, **changes)
 
     def rounded_up(self) -> "EqualPlan":
-        if is_known(self.last) and self.last > self.max_attempts:
+        if (
+            not self.is_counted
+            and is_known(self.last)
+            and float(self.last) > self.max_attempts
+        ):
             # The bound of the user ends this run.
             return self
         room = 1 << (self.max_attempts - 1).bit_length()

@@ -215,7 +215,9 @@ def affine_root(
     diagonal.
     """
     at = jnp.zeros_like(like)
-    linear = linearisable(lambda x, _: fn(x), at, None, regularisation=regularisation)
+    linear = linearisable(
+        lambda x, _: fn(x), at, None, regularisation=regularisation, rarely=True
+    )
     if linear.is_dense and regularisation is None:
         return -jnp.linalg.solve(linear.jacobian(at), linear.value(at))
     return -linear.solve(at, linear.value(at))

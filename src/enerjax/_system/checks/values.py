@@ -21,6 +21,7 @@ def direction_without_symmetry(x: Float[Array, " n"]) -> Float[Array, " n"]:
 
 @compiled_for_once
 def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]:
+    """The conditions that the values of a system must satisfy, and `all` of them."""
     inertia = system.inertia(state, args)
     blocks, eps = scaled_blocks(inertia), 1e3 * jnp.finfo(inertia.dtype).eps
     finite = lambda tree: jnp.all(
@@ -40,7 +41,7 @@ def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]
         timed.append(system.force(state.q, state.v, t, args))
     if system.driven is not None and t is not None:
         timed.append(system.driven(state.q, t, args))
-    return dict(
+    facts = dict(
         **_nonholonomic(system, state, args),
         start=finite(state),
         args=finite([x for x in jax.tree.leaves(args) if eqx.is_inexact_array(x)]),
@@ -56,6 +57,7 @@ def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]
         **_definiteness(system, inertia),
         rigid=_is_rigid(system, state, inertia, args),
     )
+    return facts | dict(all=jnp.all(jnp.stack(list(facts.values()))))
 
 
 def _nonholonomic(system: AbstractSystem, state: State, args: Args) -> dict[str, Flag]:
@@ -133,7 +135,7 @@ def check_values(system: AbstractSystem, state: State, args: Args) -> None:
     if not is_known(facts):  # the functions of the system close over tracers
         return
     # The messages contain all numbers as text, which takes longer than a short run.
-    if all(map(bool, facts.values())):
+    if facts["all"]:
         return
     functions = {role: describe(role, fn) for role, fn, _ in energies(system, state, args)}
     kinetic = functions.get("kinetic", functions.get("hamiltonian"))
