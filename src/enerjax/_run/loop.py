@@ -443,7 +443,7 @@ def for_lanes(stepper: Stepper, begin: Progress) -> Callable[[], Stepper] | None
     return lambda: dataclasses.replace(
         stepper,
         model=model.with_known_zeros(begin.state),
-        root_finder=ChordAlone(newton, if_small=True),
+        root_finder=ChordAlone(newton, above=0),
     )
 
 

@@ -6,6 +6,8 @@ import sys
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
+
 from .._programs import at_top_level, compiled, is_known, values_of
 from .._progress import Progress
 from .._results import may_need_newton, RESULTS
@@ -223,4 +225,6 @@ def _run(task: Task) -> tuple[Solution, _Outcome, bool]:
         failed=end.result != RESULTS.successful,
         needs_newton=may_need_newton(end.result),
     )
-    return solution, outcome, is_chord_alone(task.root_finder, end.warm.stages)
+    memory = jax.tree.map(lambda x: x[0], end.warm.stages)
+    alone = is_chord_alone(task.root_finder, task.scheme.stage, model, memory)
+    return solution, outcome, alone

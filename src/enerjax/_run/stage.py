@@ -41,9 +41,12 @@ from .prediction import extrapolated, Memory, memory_after, predicted
 # Enough for the linear convergence of a step that locks. A step that needs more has failed.
 MAX_ITERATIONS = 50
 # Up to this number of unknowns Newton's method is about as fast as the chord method in
-# short steps, and faster in long ones, where the chord method needs more corrections. It
-# also resolves a light, slow body beside a heavy, fast one.
+# short steps, and faster in long ones, where the chord method needs more corrections.
+# A program that must be right for all steps has it alone.
 _FEW = 16
+# Above this number of unknowns the chord method alone is tried first, where a run can be
+# made again: its program compiles faster, and its short steps are faster.
+LEAST_BY_CHORD = 8
 
 
 # Up to this number of unknowns the parts of a step are functions of machine code. In larger
@@ -90,17 +93,13 @@ def first_memory(
     added = jax.tree.map(lambda x, x0: jnp.stack([x - x0] * 3), z, flight)
     added = jax.lax.stop_gradient(added)
     flat, _ = ravel_pytree(flight)
-    has_chord = (
-        flat.size > _FEW
-        and isinstance(scheme, AbstractSchemeWithChord)
-        and model.has_delassus_matrix
-    )
-    factors = None if has_chord else kept_factors(flat.size, flat.dtype)
+    both = flat.size > _FEW and has_chord(scheme, model)
+    factors = None if both else kept_factors(flat.size, flat.dtype)
     return Memory(
         added=added,
         is_smooth=jnp.array(True),
         factors=jax.tree.map(lambda x: jnp.stack([x] * 3), factors),
-        chord_wait=jnp.array(0) if has_chord else None,
+        chord_wait=jnp.array(0) if both else None,
         carried=carried,
     )
 
@@ -144,7 +143,8 @@ def solve(
         z = jax.tree.map(jnp.multiply, x, unknown_scale)
         return jax.tree.map(jnp.divide, scheme.residual(z, problem), row_scale)
 
-    wait, alone = memory.chord_wait, is_chord_alone(root_finder, memory)
+    wait = memory.chord_wait
+    alone = is_chord_alone(root_finder, scheme, model, memory)
     root = find_root(
         scaled,
         root_finder,
@@ -164,10 +164,22 @@ def solve(
     return apart(simplified(lambda: _solved(*step, root, root_finder)))()
 
 
-def is_chord_alone(root_finder: RootFinder | ChordAlone, memory: Memory) -> bool:
+def has_chord(scheme: AbstractOneSolveScheme, model: AbstractModel) -> bool:
+    """Whether the step equations have a chord method."""
+    return isinstance(scheme, AbstractSchemeWithChord) and model.has_delassus_matrix
+
+
+def is_chord_alone(
+    root_finder: RootFinder | ChordAlone,
+    scheme: AbstractOneSolveScheme,
+    model: AbstractModel,
+    memory: Memory,
+) -> bool:
     """Whether the exact Jacobian is left out, because there is a chord method."""
-    return isinstance(root_finder, ChordAlone) and (
-        root_finder.if_small or memory.chord_wait is not None
+    return (
+        isinstance(root_finder, ChordAlone)
+        and has_chord(scheme, model)
+        and num_unknowns(memory) > root_finder.above
     )
 
 
@@ -245,7 +257,7 @@ def _solved(
     tests = lambda: _gradients_reverse(model, start, end.state)
     no = jnp.array(False)
     # Where the chord method converges, the gradients have hardly changed.
-    if is_chord_alone(root_finder, memory):
+    if is_chord_alone(root_finder, scheme, model, memory):
         reverses = no
     elif memory.chord_wait is None:
         reverses = tests()

@@ -83,11 +83,11 @@ class ChordAlone(eqx.Module):
     The exact Jacobian is more than half of the program of a step, and smooth motion does
     not need it. `newton` has the tolerances; it searches where there is no chord method.
 
-    - `if_small`: whether small systems, too, use the chord method.
+    - `above`: the number of unknowns above which the chord method searches.
     """
 
     newton: Newton
-    if_small: bool = eqx.field(static=True, default=False)
+    above: int = eqx.field(static=True)
 
 
 class Start(eqx.Module):
