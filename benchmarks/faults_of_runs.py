@@ -276,7 +276,7 @@ FAULTS = (
         "Steps begin from the worse of two guesses.",
         of(
             "step::test_the_memory_of_earlier_steps_saves_iterations_and_changes_no_result",
-            "energy::test_newton_needs_few_iterations",
+            "energy::test_a_step_needs_few_corrections",
         ),
     ),
     Fault(
