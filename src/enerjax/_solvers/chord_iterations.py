@@ -25,8 +25,9 @@ _SHRINKS = 0.5
 # reason a single quotient can be far too small: without this bound two hinged bodies in
 # space leak 3e-15 J a step; with it, 1e-16 J.
 _LEAST_CONTRACTION = 1e-2
-# The search also stops without a root after this many corrections.
-_PATIENCE = 16
+# The search also stops without a root after this many corrections. Without Newton's method
+# behind it the whole run would have to be made again, so more of them are worth a try.
+PATIENCE, PATIENCE_ALONE = 16, 24
 
 Vector = Float[Array, " n"]
 
@@ -57,14 +58,15 @@ def chord_iterations(
     newton: Newton,
     start: Start,
     guess: Vector,
+    patience: int,
 ) -> _Chord:
-    """Searches a root of `value` with the corrections `solve(value(x))`.
+    """Searches a root of `value` with at most `patience` corrections `solve(value(x))`.
 
     Convergence is measured mainly by the residual. Corrections alone would be misleading:
     the multipliers of the velocity-level constraints are small and poorly determined,
     although their equations are satisfied accurately.
     """
-    powers = powers_of(guess.dtype)
+    powers = powers_of(guess)
 
     def iteration(before: _Chord) -> _Chord:
         right = value(before.x)
@@ -86,7 +88,7 @@ def chord_iterations(
         done = done | (~shrinks & (defect <= powers.round_off) & (size <= powers.small))
         done = done & jnp.isfinite(size)
         stalls = ~shrinks & ~(contraction * before.contraction < _SHRINKS**2)
-        late = before.corrections + 1 >= _PATIENCE
+        late = before.corrections + 1 >= patience
         return _Chord(
             x=x,
             defect=defect,

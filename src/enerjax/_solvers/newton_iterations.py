@@ -51,7 +51,8 @@ class Powers(NamedTuple):
       coordinates lie.
     - `tiny`: a residual below this is round-off if a new Jacobian does not reduce it.
     - `round_off`: a residual below this is round-off if a Jacobian that has reduced it
-      before no longer does.
+      before no longer does. The largest residual of a long chain or beam is larger: forces
+      are handed on from body to body, and their rounding errors with them.
     """
 
     eps: float
@@ -62,16 +63,20 @@ class Powers(NamedTuple):
     round_off: float
 
 
-def powers_of(dtype: jnp.dtype) -> Powers:
-    """The thresholds for a precision."""
-    eps = float(jnp.finfo(dtype).eps)
+# Up to this number of unknowns the threshold of round-off is that of a single body.
+_FEW = 64
+
+
+def powers_of(x: Float[Array, " n"]) -> Powers:
+    """The thresholds for the precision and the number of the unknowns."""
+    eps = float(jnp.finfo(x.dtype).eps)
     return Powers(
         eps=eps,
         floor=eps**0.125,
         small=eps**0.25,
         moderate=eps**0.5,
         tiny=eps**0.75,
-        round_off=eps**0.875,
+        round_off=eps**0.875 * max(x.size / _FEW, 1),
     )
 
 
@@ -190,7 +195,7 @@ def _attempt(
     damped: Flag | bool,
 ) -> _Iterate:
     """A search from one guess."""
-    powers = powers_of(first.x.dtype)
+    powers = powers_of(first.x)
 
     def linearise(iterate: _Iterate) -> _Iterate:
         factors = iterate.factors.renewed(residual.jacobian(iterate.x))

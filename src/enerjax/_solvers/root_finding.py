@@ -13,7 +13,7 @@ from typing_extensions import TypeAliasType
 
 from .._programs import part, unmerged
 from .._types import Count, Flag, Scalar
-from .chord_iterations import chord_iterations
+from .chord_iterations import chord_iterations, PATIENCE, PATIENCE_ALONE
 from .linear.dense import AbstractFactors, Inverse, SMALL
 from .linear.jacobian import Linearisable, linearisable
 from .newton import ChordAlone, Newton, Start
@@ -114,7 +114,8 @@ def search(
 ) -> Root:
     if isinstance(root_finder, ChordAlone):
         if chord is not None:
-            return _by_chord(fn, chord, root_finder.newton, args, start)
+            newton = root_finder.newton
+            return _by_chord(fn, chord, newton, args, start, PATIENCE_ALONE)
         root_finder = root_finder.newton
     if not isinstance(root_finder, Newton):
         solution = optx.root_find(
@@ -143,7 +144,7 @@ def search(
     exact = with_jacobian(flat_fn, flat, args, root_finder, regularisation, start, chord)
     if chord is None or not has_chord_search(root_finder):
         return _iterated(exact, root_finder, start, max_iterations)
-    first = _by_chord(fn, chord, root_finder, args, start)
+    first = _by_chord(fn, chord, root_finder, args, start, PATIENCE)
 
     def again() -> Root:
         # Under `vmap` this is evaluated for all lanes, also for those with a root.
@@ -163,6 +164,7 @@ def _by_chord(
     newton: Newton,
     args: PyTree,
     start: Start,
+    patience: int,
 ) -> Root:
     guess, unravel = ravel_pytree(start.guess)
     prepared = part(lambda: chord.prepare(start.guess, args))()
@@ -178,7 +180,8 @@ def _by_chord(
         correct = lambda x: leaves_of(chord.correct(unravel(x), args, prepared))
         return joined(unmerged(correct)(right))
 
-    last = part(lambda: chord_iterations(value, solve, newton, start, guess))()
+    search = lambda: chord_iterations(value, solve, newton, start, guess, patience)
+    last = part(search)()
     return Root(
         value=unravel(last.x),
         factors=start.factors,
