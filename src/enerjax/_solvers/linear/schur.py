@@ -11,6 +11,7 @@ elimination needs no pivoting.
 import functools
 from collections.abc import Callable
 from itertools import pairwise
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,7 +23,6 @@ from jaxtyping import Array, Float
 from ..._programs import Indices, jacobian_pattern, shape_of, summed, unmerged
 from .block_diagonal import BlockDiagonal, Symmetric
 from .block_tridiagonal import block_sizes, coloured_products, column_colours
-from .dense import inverse
 
 
 # The number of unknowns up to which `B` is treated as dense.
@@ -117,7 +117,7 @@ class SchurTables(Indices):
         """The entries of `B` in the columns that two blocks of rows have in common.
 
         Returns the indices of the entries of the rows of both blocks of each pair, shape
-        `(2, pairs, width, columns)`. Indices of absent entries are one past the end.
+        `(2, pairs, columns, width)`. Indices of absent entries are one past the end.
         """
         size, none = self.transposed.shape[0], self.columns.size
         # One more row for the absent rows of short blocks.
@@ -126,12 +126,12 @@ class SchurTables(Indices):
         in_both = lambda a, b: np.intersect1d(columns[a], columns[b])
         shared = [found[found < size] for found in (in_both(*pair) for pair in pairs)]
         max_shared = max(map(len, shared), default=0)
-        table = np.full((2, len(pairs), self.width, max_shared), none)
+        table = np.full((2, len(pairs), max_shared, self.width), none)
         for k, (sides, found) in enumerate(zip(pairs, shared, strict=True)):
             for side, rows in enumerate(sides):
                 row, entry = np.nonzero(np.isin(columns[rows], found))
                 at = np.searchsorted(found, columns[rows][row, entry])
-                table[side, k, row, at] = rows[row] * columns.shape[1] + entry
+                table[side, k, at, row] = rows[row] * columns.shape[1] + entry
         return table
 
 
@@ -260,7 +260,7 @@ def _blocks(tables: SchurTables, rows: Array, weighted: Array) -> tuple[Array, A
 
     def blocks(table: np.ndarray) -> Array:
         one, other = unmerged(lambda x, y: (x[table[0]], y[table[1]]))(left, right)
-        terms = (one[:, :, None, k] * other[:, None, :, k] for k in range(table.shape[-1]))
+        terms = (one[:, k, :, None] * other[:, k, None] for k in range(table.shape[2]))
         shape = (table.shape[1], tables.width, tables.width)
         return functools.reduce(jnp.add, terms, jnp.zeros(shape, rows.dtype))
 
@@ -270,18 +270,22 @@ def _blocks(tables: SchurTables, rows: Array, weighted: Array) -> tuple[Array, A
 
 def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """The inverse of a positive definite matrix, by in-place elimination; no pivoting."""
-    size = matrix.shape[0]
-    if size > _UNROLLED:
-        return inverse(matrix)
-    for k in range(size):
+    order = np.arange(matrix.shape[0])
+
+    def column(k: Any, matrix: Array) -> Array:
         pivot = 1 / matrix[k, k]
-        row, column = matrix[k] * pivot, matrix[:, k]
-        own = np.arange(size) == k
-        row, column = jnp.where(own, pivot, row), jnp.where(own, -1, column)
+        own = order == k
+        row = jnp.where(own, pivot, matrix[k] * pivot)
+        factors = jnp.where(own, -1, matrix[:, k])
         left = jnp.where(own[None] | own[:, None], 0, matrix)
-        matrix = left - column[:, None] * row[None]
-    return matrix
+        return left - factors[:, None] * row[None]
+
+    if order.size > _UNROLLED:
+        return jax.lax.fori_loop(0, order.size, column, matrix)
+    return functools.reduce(lambda matrix, k: column(k, matrix), order, matrix)
 
 
 def _times(a: Float[Array, "m n"], b: Float[Array, "n k"]) -> Float[Array, "m k"]:
-    return summed(a[:, None] * b.T[None])
+    # In this form the innermost loop goes along a row of `b`, and uses vectors.
+    terms = (a[:, k, None] * b[None, k] for k in range(a.shape[1]))
+    return functools.reduce(jnp.add, terms)
