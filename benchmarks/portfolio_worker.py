@@ -207,7 +207,12 @@ def _disagreement(
 
     off = []
     for eps in _STEPS:
-        direction = slope(moved, eps)
+        try:
+            direction = slope(moved, eps)
+        except ValueError:
+            # The rods of a long chain are short beside its coordinates: the start has left
+            # its constraints too far to be repaired.
+            continue
         by_gradient = sum(
             float(np.sum(x * y))
             for x, y in zip(*map(jax.tree.leaves, (gradient, direction)), strict=True)
