@@ -319,6 +319,15 @@ def test_residuals_of_two_levels_may_shrink_in_turn(searched_by):
     assert jnp.max(jnp.abs(sol.audit.leak)) <= 1e3 * EPS * jnp.max(sol.audit.kinetic)
 
 
+def test_what_is_round_off_grows_with_the_system(searched_by):
+    """The residual of 512 points in their first steps stays above 1e-13."""
+    system, start, args = ej.problems.chain(512)
+    sol = ej.simulate(system, ej.EnergyPreserving(), start, args, h=1e-4, num_steps=3)
+    assert searched_by == ["ChordAlone"]
+    # Round-off of the energies of 512 points.
+    assert jnp.max(jnp.abs(sol.audit.leak)) <= 512 * EPS * jnp.ptp(sol.audit.potential)
+
+
 @pytest.mark.parametrize("damped", [False, True])
 def test_stiff_forces_are_noticed_before_the_first_program(searched_by, damped):
     """A row of points on springs, or in dampers, of ten radians a step."""
