@@ -60,7 +60,9 @@ def _root_jvp(primals, tangents):
     unmoved = jax.tree.map(is_none, t_args, is_leaf=is_none)
     fixed, moved = eqx.partition(args, unmoved, is_leaf=is_none)
     flat, unravel, flat_fn = flattened(fn, root.value)
-    by_args = part(lambda moved: flat_fn(flat, eqx.combine(moved, fixed)))
+    by_args = lambda moved: flat_fn(flat, eqx.combine(moved, fixed))
+    # Programs without a chord method have no parts, and can be longer as one function.
+    by_args = by_args if chord is None else part(by_args)
     _, rate = jax.jvp(by_args, (moved,), (t_args,))
     regularisation = flat_of(args[-1])
     exact = with_jacobian(flat_fn, flat, args, root_finder, regularisation, start, chord)
