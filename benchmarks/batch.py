@@ -28,6 +28,7 @@ import harness
 import jax
 import jax.numpy as jnp
 import numpy as np
+import space_mechanisms
 
 import enerjax as ej
 
@@ -58,9 +59,7 @@ def problem() -> ej.problems.Problem:
 
 
 def two_bodies() -> tuple[ej.AbstractSystem, ej.State, Any]:
-    from bodies import scene
-
-    return scene(2).build()
+    return space_mechanisms.chain(2).scene().build()
 
 
 def scaled(key: str) -> Callable[[Any, Any], Any]:

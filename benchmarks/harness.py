@@ -30,20 +30,6 @@ DOCUMENTED = Path(__file__).parents[1] / "docs" / "pictures"
 _TIME = "us_per_step"
 
 
-def draw_costs(rows: list[Row], path: Path, label: str, title: str) -> None:
-    """The time of a step against the size of the work, a line for each mode."""
-    import matplotlib.pyplot as plt
-
-    figure, axis = plt.subplots(figsize=(6, 4), layout="constrained")
-    for mode, mark in (("exudyn", "s-"), ("default", "o-"), ("fast", "^-")):
-        chosen = [row for row in rows if row["mode"] == mode and "us_per_step" in row]
-        sizes = [row["work"] for row in chosen]
-        axis.loglog(sizes, [row["us_per_step"] for row in chosen], mark, label=mode)
-    axis.set(xlabel=label, ylabel="microseconds a step", title=title)
-    axis.legend()
-    figure.savefig(path, dpi=130)
-
-
 def run(
     script: str,
     rows_of: Callable[..., list[Row]],

@@ -29,14 +29,14 @@ class _Search(NamedTuple):
     - `x`, `left`: the solution so far, and its residual.
     - `directions`, `images`: those of the corrections so far, and their products with the
       matrix, which are orthonormal. Rows that are not yet used are zero.
-    - `count`: the number of corrections.
+    - `used`: the number of rows that are used, and of corrections.
     """
 
     x: Vector
     left: Vector
     directions: Float[Array, "most n"]
     images: Float[Array, "most n"]
-    count: Count
+    used: Count
 
 
 def solve_by_products(product: Map, approximate: Map, right: Vector) -> Vector:
@@ -54,7 +54,7 @@ def solve_by_products(product: Map, approximate: Map, right: Vector) -> Vector:
     size = norm(right)
 
     def correct(search: _Search) -> _Search:
-        x, left, directions, images, count = search
+        x, left, directions, images, used = search
         direction = approximate(left)
         image = product(direction)
 
@@ -66,7 +66,7 @@ def solve_by_products(product: Map, approximate: Map, right: Vector) -> Vector:
         # The second pass removes what cancellation leaves in the first.
         for _ in range(2):
             pair = image, direction
-            image, direction = jax.lax.fori_loop(0, count, orthogonal, pair)
+            image, direction = jax.lax.fori_loop(0, used, orthogonal, pair)
         length = norm(image)
         scale = jnp.where(length > 0, 1 / length, 0)
         image, direction = scale * image, scale * direction
@@ -74,14 +74,14 @@ def solve_by_products(product: Map, approximate: Map, right: Vector) -> Vector:
         return _Search(
             x=x + share * direction,
             left=left - share * image,
-            directions=put(directions, direction, count, 0),
-            images=put(images, image, count, 0),
-            count=count + 1,
+            directions=put(directions, direction, used, 0),
+            images=put(images, image, used, 0),
+            used=used + 1,
         )
 
     none = jnp.zeros((most, right.size), right.dtype)
     first = _Search(jnp.zeros_like(right), right, none, none, jnp.array(0))
-    goes_on = lambda c: (norm(c.left) > 8 * eps * size) & (c.count < most)
+    goes_on = lambda c: (norm(c.left) > 8 * eps * size) & (c.used < most)
     last = jax.lax.while_loop(goes_on, correct, first)
     return jnp.where(norm(last.left) <= eps**0.75 * size, unit * last.x, jnp.nan)
 
@@ -92,19 +92,20 @@ def solver_by_products(fn: Map, x: Vector, approximate: Map) -> Callable[[Vector
     `approximate` nearly inverts the Jacobian; its derivatives are not needed.
     """
 
-    def solve(_: Map, right: Vector) -> Vector:
-        _, product = jax.linearize(fn, x)
-        return solve_by_products(product, approximate, right)
+    def solve(right: Vector) -> Vector:
+        _, push = jax.linearize(fn, x)
+        return solve_by_products(push, approximate, right)
 
-    def solve_transposed(_: Map, right: Vector) -> Vector:
-        _, product = jax.vjp(fn, x)
+    def solve_transposed(right: Vector) -> Vector:
+        _, pull = jax.vjp(fn, x)
         _, nearly = jax.vjp(approximate, right)
-        return solve_by_products(lambda y: product(y)[0], lambda y: nearly(y)[0], right)
+        return solve_by_products(lambda y: pull(y)[0], lambda y: nearly(y)[0], right)
 
-    def product(t: Vector) -> Vector:
-        return jax.jvp(fn, (x,), (t,))[1]
-
-    inside = lambda solve: lambda _, right: part(lambda right: solve(_, right))(right)
+    # The products that JAX passes to these have lost the known indices, without which the
+    # iterations cannot be one function.
     return lambda right: jax.lax.custom_linear_solve(
-        product, right, inside(solve), inside(solve_transposed)
+        lambda t: jax.jvp(fn, (x,), (t,))[1],
+        right,
+        lambda _, right: part(solve)(right),
+        lambda _, right: part(solve_transposed)(right),
     )
