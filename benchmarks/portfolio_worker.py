@@ -31,7 +31,7 @@ _LEAST_SECONDS = 0.05
 # How much finer the steps of a reference are.
 _FINER = {"mujoco": 8, "exudyn": 10}
 # Lengths of the steps of difference quotients, relative to the numbers.
-_STEPS = (1e-4, 3e-5, 1e-5, 3e-6)
+_STEPS = (1e-4, 3e-5, 1e-5, 3e-6, 1e-6)
 Record = dict[str, Any]
 # From a word of the input to microseconds.
 Timers = dict[str, Callable[[], float]]
