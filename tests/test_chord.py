@@ -218,6 +218,31 @@ def test_a_chord_that_misleads_gives_no_wrong_derivative():
     np.testing.assert_array_equal(solver(jnp.zeros(SIZE)), 0)
 
 
+@pytest.mark.parametrize("size", [2, 6, 20])
+def test_a_breakdown_of_the_products_gives_no_wrong_derivative(size):
+    """With a skew-symmetric matrix the first direction is of no use."""
+    rng = np.random.default_rng(size)
+    matrix = rng.normal(size=(size, size))
+    matrix = jnp.asarray(matrix - matrix.T)
+    right = jnp.asarray(rng.normal(size=size))
+    solver = solver_by_products(lambda x: matrix @ x, right, lambda x: x)
+    assert jnp.all(jnp.isnan(solver(right)))
+
+
+def test_products_solve_where_the_chord_is_far_off():
+    """Random matrices, and the identity as approximate inverse."""
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        matrix = jnp.asarray(np.eye(SIZE) + 0.3 * rng.normal(size=(SIZE, SIZE)))
+        right = jnp.asarray(rng.normal(size=SIZE))
+        solver = solver_by_products(lambda x, m=matrix: m @ x, right, lambda x: x)
+        found, expected = solver(right), np.linalg.solve(matrix, right)
+        rest = jnp.linalg.norm(matrix @ found - right)
+        assert rest <= 1e-13 * jnp.linalg.norm(right)  # round-off
+        error = np.linalg.norm(found - expected) / np.linalg.norm(expected)
+        assert error <= 1e-12 * np.linalg.cond(matrix)
+
+
 def test_lanes_that_need_newton_do_not_affect_others():
     strengths = jnp.array([1e-3, 30.0])
     lanes = jax.vmap(lambda s: _root(s, ARGS, jnp.zeros(SIZE)))(strengths)

@@ -88,23 +88,20 @@ class Readable:
 
 
 def once_per_structure(check: Callable[..., None]) -> Callable[..., None]:
-    """A check of functions that is not repeated for arguments of the same structure.
+    """A check of shapes and types that is not repeated for arguments of the same structure.
 
     To trace the functions of a user takes milliseconds, which would be most of a short run.
     Inside of transformations every call checks.
     """
 
     @functools.lru_cache(maxsize=128)
-    def memory(structure: _Structure) -> list[str]:
-        return []
+    def of_structure(structure: _Structure) -> None:
+        check(*_joined(*structure))
 
     @functools.wraps(check)
     def call(*args: Any) -> None:
         structure = structure_of(args) if at_top_level(args) else None
-        passed = [] if structure is None else memory(structure)
-        if not passed:
-            check(*args)
-            passed.append("passed")
+        return check(*args) if structure is None else of_structure(structure)
 
     return call
 

@@ -35,7 +35,7 @@ def _pad(x, filling, *, padding_config, **_):
         for n, (_, _, inner) in zip(np.shape(x), padding_config, strict=True)
     ]
     # Programs can be evaluated entry by entry, with entries that are objects.
-    kind = object if x.dtype == object else float
+    kind = np.result_type(x.dtype, np.asarray(filling).dtype)
     spread = np.full(lengths, filling, dtype=kind)
     spread[tuple(slice(None, None, inner + 1) for _, _, inner in padding_config)] = x
     added = [(max(low, 0), max(high, 0)) for low, high, _ in padding_config]

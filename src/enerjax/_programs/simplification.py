@@ -78,6 +78,8 @@ class _Once:
         self._needed = needed
         # The values are kept, because the identity of one that is gone can be used again.
         self._found: dict[Any, tuple[list[Any], list[Any]]] = {}
+        # Equal indices are one array, so that what uses them is found to be equal too.
+        self._indices: dict[Any, np.ndarray] = {}
 
     def __call__(self, equation: Any, values: list[Any]) -> list[Any]:
         if id(equation) not in self._needed:
@@ -85,7 +87,8 @@ class _Once:
         primitive, params = equation.primitive, equation.params
         indices = _indices(equation, values)
         if indices is not None:
-            return indices
+            content = lambda x: (x.tobytes(), x.shape, x.dtype)
+            return [self._indices.setdefault(content(x), x) for x in indices]
         key = primitive, tuple(params.items()), tuple(map(_identity, values))
         if equation.effects or not is_hashable(key):
             return evaluate(primitive, values, params)
@@ -100,15 +103,16 @@ def _indices(equation: Any, values: list[Any]) -> list[Any] | None:
     if any(not _is_index(x) or x.size > _MANY for x in avals):
         return None
     known = [known_numbers(x) for x in values]
-    if any(x is None for x in known) or equation.effects:
+    # NumPy rounds numbers to indices in another way than XLA.
+    if equation.effects or any(x is None or not _is_index(x) for x in known):
         return None
     with jax.ensure_compile_time_eval():
         out = evaluated(equation.primitive, known, equation.params)
     return [np.asarray(x, aval.dtype) for x, aval in zip(out, avals, strict=True)]
 
 
-def _is_index(aval: Any) -> bool:
-    return getattr(aval.dtype, "kind", "key") in "iub"
+def _is_index(x: Any) -> bool:
+    return getattr(x.dtype, "kind", "key") in "iub"
 
 
 def _identity(value: Any) -> Any:

@@ -9,7 +9,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .._discrete import AbstractCorrected, AbstractDerivative, ChainRule
-from .._programs import compiled_for_once, is_known, once_per_structure
+from .._programs import compiled_for_once, is_known
 from .._system import (
     AbstractSystem,
     describe,
@@ -29,7 +29,6 @@ _ROUND_OFF = 1e4
 _DISTANCE = 1e-3
 
 
-@once_per_structure
 def check_derivatives(
     scheme: AbstractScheme, system: AbstractSystem, state: State, args: Args
 ) -> None:

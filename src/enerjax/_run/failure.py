@@ -24,8 +24,9 @@ def raise_failure(
     reached: Scalar,
     h: Scalar | None = None,
 ) -> Solution:
-    """The solution of a run that has not failed; else an error with step, time, cause and
-    remedy.
+    """Raises an error with step, time, cause and remedy for a failed run.
+
+    Returned is the solution. Where it is traced, a failure raises when the program runs.
 
     `reached` is the time that the run has reached, `h` the length of its steps if all have
     the same.

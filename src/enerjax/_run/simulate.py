@@ -114,10 +114,10 @@ def simulate(
       the cause (under `jit`, `vmap` and `grad` only the cause, and for all lanes at once).
       With `False` check `result`: rows after the failure are NaN.
 
-    A run with equal steps outside of `jit` and other transformations is first made without
-    Newton's method, whose program compiles for longer. If a step needs it, the run is made
-    again from its start, and `saveat.fn` is evaluated again. Later runs of the system then
-    have Newton's method from the beginning; they agree to round-off.
+    A run with equal steps outside of `jit` and `vmap` is first made without Newton's
+    method, whose program compiles for longer, and so are its derivatives. If a step needs
+    it, the run is made again from its start, and `saveat.fn` is evaluated again. Later runs
+    of the system then have Newton's method from the beginning; they agree to round-off.
 
     With `progress`, `checkpoint` or `resume` a run is made piece by piece. Its program is
     another one than that of a plain run, with which it agrees to round-off; among such runs

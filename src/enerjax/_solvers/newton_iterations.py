@@ -76,7 +76,7 @@ def powers_of(x: Float[Array, " n"]) -> Powers:
         small=eps**0.25,
         moderate=eps**0.5,
         tiny=eps**0.75,
-        round_off=eps**0.875 * max(x.size / _FEW, 1),
+        round_off=min(eps**0.875 * max(x.size / _FEW, 1), eps**0.75),
     )
 
 

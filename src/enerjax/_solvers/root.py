@@ -78,7 +78,8 @@ def _root_jvp(primals, tangents):
     return root, eqx.tree_at(lambda root: root.value, still, unravel(change))
 
 
-# Up to this number of unknowns conjugate residuals end in any case.
+# Up to this number of unknowns there can be as many products as unknowns. They suffice
+# where the approximate Jacobian is far off too; if they ever do not, the rate is NaN.
 _FEW = 64
 
 
@@ -101,8 +102,10 @@ def _change(
     by_products = solver_by_products(exact.value, flat, correct)
     if isinstance(root_finder, ChordAlone) or flat.size <= _FEW:
         return by_products(right)
+    # Lanes of a batch evaluate both. Without a right-hand side the products end at once.
+    by_chord = lambda right: by_products(jnp.where(root.by_chord, right, 0))
     by_entries = lambda right: exact.solve(flat, right)
-    return jax.lax.cond(root.by_chord, by_products, by_entries, right)
+    return jax.lax.cond(root.by_chord, by_chord, by_entries, right)
 
 
 def _null_space_rate(

@@ -63,7 +63,7 @@ def _equation(eqn: Any, values: list[Any]) -> list[Any]:
             count = len(program.jaxpr.constvars)
             return interpret(program.jaxpr, values[:count], values[count:], _equation)
         if name == LINEAR_SOLVE:
-            return _solved(values, params)
+            return _of_linear_solve(values, params)
         if name == CONTRACTION and eqn.outvars[0].aval.size <= LARGEST_SUM:
             left, right = values
             return [written_out(left, right, params["dimension_numbers"])]
@@ -107,7 +107,7 @@ def _needs_rewriting(jaxpr: Any) -> bool:
     )
 
 
-def _solved(values: list[Any], params: dict[str, Any]) -> list[Any]:
+def _of_linear_solve(values: list[Any], params: dict[str, Any]) -> list[Any]:
     """The solution that `jax.lax.custom_linear_solve` finds, without its derivatives."""
     counts, program = params["const_lengths"], params["jaxprs"].solve
     first = counts.matvec + counts.vecmat

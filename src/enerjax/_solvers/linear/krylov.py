@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..._programs import part
-from ..._types import Count
+from ..._types import Count, Scalar
 
 
 Vector = Float[Array, " n"]
@@ -39,24 +39,49 @@ class _Search(NamedTuple):
     used: Count
 
 
+# The most searches. Each begins with the true residual of the one before, from which the
+# residual that the iterations keep differs by round-off, and after a breakdown by more.
+_SEARCHES = 3
+
+
 def solve_by_products(product: Map, approximate: Map, right: Vector) -> Vector:
     """The solution `x` of `product(x) = right`, where `approximate` nearly inverts it.
 
-    It is NaN if the residual has not decreased by three quarters of the digits.
+    It is NaN if its residual is not smaller than `right` by three quarters of the digits.
     """
-    most, eps = min(right.size, _MOST), jnp.finfo(right.dtype).eps
-    norm = lambda x: jnp.sqrt(jnp.sum(x * x))
-    put = jax.lax.dynamic_update_index_in_dim
+    eps = jnp.finfo(right.dtype).eps
     # The squares of extreme numbers would overflow or vanish.
     largest = jnp.max(jnp.abs(right), initial=0.0)
     unit = jnp.where(largest > 0, largest, 1.0)
     right = right / unit
-    size = norm(right)
+    size = _norm(right)
+
+    def refined(carry: tuple[Vector, Vector, Count]) -> tuple[Vector, Vector, Count]:
+        x, left, searches = carry
+        x = x + _found(product, approximate, left)
+        return x, right - product(x), searches + 1
+
+    goes_on = lambda carry: (_norm(carry[1]) > eps**0.875 * size) & (carry[2] < _SEARCHES)
+    first = jnp.zeros_like(right), right, jnp.array(0)
+    x, left, _ = jax.lax.while_loop(goes_on, refined, first)
+    return jnp.where(_norm(left) <= eps**0.75 * size, unit * x, jnp.nan)
+
+
+def _norm(x: Vector) -> Scalar:
+    return jnp.sqrt(jnp.sum(x * x))
+
+
+def _found(product: Map, approximate: Map, right: Vector) -> Vector:
+    """The solution that one search finds."""
+    most, eps = min(right.size, _MOST), jnp.finfo(right.dtype).eps
+    put = jax.lax.dynamic_update_index_in_dim
+    size = _norm(right)
 
     def correct(search: _Search) -> _Search:
         x, left, directions, images, used = search
         direction = approximate(left)
         image = product(direction)
+        before = _norm(image)
 
         def orthogonal(k: Count, pair: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
             image, direction = pair
@@ -67,8 +92,9 @@ def solve_by_products(product: Map, approximate: Map, right: Vector) -> Vector:
         for _ in range(2):
             pair = image, direction
             image, direction = jax.lax.fori_loop(0, used, orthogonal, pair)
-        length = norm(image)
-        scale = jnp.where(length > 0, 1 / length, 0)
+        length = _norm(image)
+        # Less than that is round-off.
+        scale = jnp.where(length > eps**0.75 * before, 1 / length, 0)
         image, direction = scale * image, scale * direction
         share = jnp.sum(image * left)
         return _Search(
@@ -81,15 +107,14 @@ def solve_by_products(product: Map, approximate: Map, right: Vector) -> Vector:
 
     none = jnp.zeros((most, right.size), right.dtype)
     first = _Search(jnp.zeros_like(right), right, none, none, jnp.array(0))
-    goes_on = lambda c: (norm(c.left) > 8 * eps * size) & (c.used < most)
-    last = jax.lax.while_loop(goes_on, correct, first)
-    return jnp.where(norm(last.left) <= eps**0.75 * size, unit * last.x, jnp.nan)
+    goes_on = lambda c: (_norm(c.left) > 8 * eps * size) & (c.used < most)
+    return jax.lax.while_loop(goes_on, correct, first).x
 
 
 def solver_by_products(fn: Map, x: Vector, approximate: Map) -> Callable[[Vector], Vector]:
     """A function that solves with the Jacobian of `fn` at `x`, and can be transposed.
 
-    `approximate` nearly inverts the Jacobian; its derivatives are not needed.
+    `approximate` is linear and nearly inverts the Jacobian.
     """
 
     def solve(right: Vector) -> Vector:
