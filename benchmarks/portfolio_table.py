@@ -132,6 +132,7 @@ def _script(row: Record) -> str:
 def draw(rows: list[Record], path: Path) -> None:
     """The ratio of times to EXUDYN, and the seconds of the first calls, of each work."""
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     panels = (
         ("time of a step / EXUDYN's", "ratio", _ratio),
@@ -154,9 +155,13 @@ def draw(rows: list[Record], path: Path) -> None:
             if aim is not None:
                 axis.plot(aim, place, "|k")
         axis.set(xlabel=label, xscale="log")
+        axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.xaxis.set_major_formatter("{x:g}")
+        axis.xaxis.set_minor_formatter(NullFormatter())
         axis.grid(axis="y", linewidth=0.3)
     axes[0].set_yticks(range(len(names)), names, fontsize=7)
-    axes[0].invert_yaxis()
+    axes[0].set_ylim(len(names), -1)
+    figure.suptitle("dots: measured, red above the aim; bars: aims", fontsize=9)
     figure.tight_layout()
     figure.savefig(path, dpi=130)
 
