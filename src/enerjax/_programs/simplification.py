@@ -1,8 +1,8 @@
-"""Programs without operations that are repeated, or whose results are not used.
+"""Programs without operations that are repeated, not used, or known while they are traced.
 
-XLA leaves both out of the code that it generates. Before that they are traced, derived and
-translated as often as their program occurs in another one. Half of the operations of a
-residual are of this kind.
+Known are the operations on indices. XLA leaves all of these out of the code that it
+generates. Before that they are traced, derived and translated as often as their program
+occurs in another one. Half of the operations of a residual are of this kind.
 """
 
 from collections.abc import Callable, Iterable, Iterator

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, PyTree
 
-from .._programs import compiled, compiled_for_once, is_known
+from .._programs import compiled, is_known
 from .._results import RESULTS, tally
 from .._system import Names, State
 from .._types import Count, Scalar
@@ -204,7 +204,6 @@ class Solution(eqx.Module):
 
 
 @compiled
-@compiled_for_once
 def first_rows(solution: Solution, count: int) -> Solution:
     """The solution without the rows after the first `count` rows."""
 

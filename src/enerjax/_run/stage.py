@@ -46,7 +46,7 @@ MAX_ITERATIONS = 50
 _FEW = 16
 # Above this number of unknowns the chord method alone is tried first, where a run can be
 # made again: its program compiles faster, and its short steps are faster.
-LEAST_BY_CHORD = 8
+MOST_BY_NEWTON = 8
 
 
 # Up to this number of unknowns the parts of a step are functions of machine code. In larger

@@ -27,7 +27,7 @@ from .._solvers import ChordAlone
 from .._system import State, System
 from .._types import Scalar
 from .loop import dispensable_newton
-from .stage import LEAST_BY_CHORD
+from .stage import MOST_BY_NEWTON
 from .step import model_for
 from .task import Task
 
@@ -77,7 +77,7 @@ def chord_alone(task: Task, values: Task) -> Task | None:
         contraction = values_of(_contraction(values))
         if bool(contraction > _CONTRACTS):
             return None
-    return dataclasses.replace(task, root_finder=ChordAlone(newton, LEAST_BY_CHORD))
+    return dataclasses.replace(task, root_finder=ChordAlone(newton, MOST_BY_NEWTON))
 
 
 def remember_newton(task: Task) -> None:

@@ -10,7 +10,7 @@ from .._operators import AbstractModel, Increment, SeparableModel
 from .._programs import num_operations, simplified, why_not_one_function
 from .._run.inputs import prepare
 from .._run.loop import dispensable_newton, Stepper
-from .._run.stage import free_flight, is_chord_alone, LEAST_BY_CHORD, step_problem
+from .._run.stage import free_flight, is_chord_alone, MOST_BY_NEWTON, step_problem
 from .._run.step import model_for
 from .._run.step_sizes import End, EqualSteps
 from .._solvers import ChordAlone, flattened, linearisable, Newton, RootFinder, SMALL
@@ -110,7 +110,7 @@ def _explained(
     dispensable = dispensable_newton(root_finder, scheme, plan, None, model.system)
     search = root_finder
     if dispensable is not None:
-        search = ChordAlone(dispensable, LEAST_BY_CHORD)
+        search = ChordAlone(dispensable, MOST_BY_NEWTON)
     stepper = Stepper(scheme, model, plan, search, None)
     begin = stepper.begin(start)
     memory = jax.tree.map(lambda x: x[0], begin.warm.stages)
