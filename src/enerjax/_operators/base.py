@@ -264,8 +264,8 @@ class AbstractModel(eqx.Module):
         """
 
     @abc.abstractmethod
-    def delassus_matrix(self, q: Coordinates, t: Time) -> DelassusMatrix:
-        """`B M^-1 B^T` at a position. It exists only if `has_delassus_matrix`."""
+    def delassus_matrix(self, state: State) -> DelassusMatrix:
+        """`B M^-1 B^T` at a state. It exists only if `has_delassus_matrix`."""
 
     @abc.abstractmethod
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:

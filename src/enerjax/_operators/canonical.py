@@ -5,12 +5,20 @@ In the notation of `base.py`, `L = I` and `G = 0`.
 
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._discrete import AbstractDerivative
-from .._solvers import affine_root, as_dense, Symmetric
+from .._solvers import (
+    affine_root,
+    as_dense,
+    schur,
+    schur_tables,
+    SchurTables,
+    Symmetric,
+)
 from .._system import AbstractCanonicalSystem, State
 from .._types import Args, Coordinates, JointMultipliers, Multipliers, Scalar, Velocities
 from .base import AbstractModel, Reaction
@@ -24,11 +32,17 @@ class CanonicalModel(AbstractModel):
     system: AbstractCanonicalSystem
     args: Args
     scales: Scales
+    # The index tables of `delassus_matrix`; `None` where there is none.
+    constraint_tables: SchurTables | None = eqx.field(static=True)
 
     def __init__(self, system: AbstractCanonicalSystem, state: State, args: Args):
         self.system = system
         self.args = args
-        self.scales = self._scales(self.to_internal(state))
+        state = self.to_internal(state)
+        self.scales = self._scales(state)
+        rest = jnp.zeros_like(state.q)
+        tables = lambda: schur_tables(self._rates_of_joints(state), rest, self.metric(state))
+        self.constraint_tables = None if system.redundant else tables()
 
     @property
     def has_own_momenta(self) -> bool:
@@ -237,10 +251,20 @@ class CanonicalModel(AbstractModel):
 
     @property
     def has_delassus_matrix(self) -> bool:
-        return False
+        return self.scales.constraint.size == 0 or self.constraint_tables is not None
 
-    def delassus_matrix(self, q: Coordinates, t: Time) -> DelassusMatrix:
-        raise NotImplementedError
+    def delassus_matrix(self, state: State) -> DelassusMatrix:
+        weight = self.system.inverse_inertia(state.q, state.v, self.args)
+        if self.constraint_tables is None:
+            return DelassusMatrix(weight, None, None)
+        rest = jnp.zeros_like(state.q)
+        rows = schur(self.constraint_tables, self._rates_of_joints(state), rest, weight)
+        return DelassusMatrix(weight, rows, None)
+
+    def _rates_of_joints(self, state: State) -> Callable[[Array], JointMultipliers]:
+        """The rates of the joints, as a linear function of those of the coordinates."""
+        joint = self.joint_near(state.q, state.t)
+        return lambda rates: jax.jvp(joint, (state.q,), (rates,))[1]
 
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
         q, p, t = state.q, state.v, state.t

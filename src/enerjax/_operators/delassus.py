@@ -32,35 +32,40 @@ class DelassusMatrix(eqx.Module):
 
     - `inverse_inertia`: `M^-1`.
     - `schur`: `C`, and the factors of `G`. If coordinates are redundant, it has further
-      columns for the rates of the coordinate constraints, with a weight of zero.
+      columns for the rates of the coordinate constraints, with a weight of zero. `None` if
+      there are no joints.
     - `frames`: the map to the rates of redundant coordinates; `None` if there are none.
     """
 
     inverse_inertia: Symmetric
-    schur: Schur
+    schur: Schur | None
     frames: Frames | None
 
     def product(self, velocity: Velocities) -> Multipliers:
         """`C velocity`, the rates of change of the joints."""
-        rest = self._num_columns - velocity.size
+        if self.schur is None:
+            return velocity[:0]
+        rest = self.schur.tables.transposed.shape[0] - velocity.size
         return self.schur.product(jnp.pad(velocity, (0, rest)) if rest else velocity)
+
+    def force(self, impulses: Multipliers) -> Velocities:
+        """`C^T impulses`"""
+        count = self.inverse_inertia.shape[0]
+        if self.schur is None:
+            return jnp.zeros((count,), impulses.dtype)
+        return self.schur.transposed(impulses)[:count]
 
     def velocity(self, impulses: Multipliers) -> Velocities:
         """`M^-1 C^T impulses`, the velocities that impulses of the joints cause."""
-        count = self.inverse_inertia.shape[0]
-        return self.inverse_inertia @ self.schur.transposed(impulses)[:count]
+        return self.inverse_inertia @ self.force(impulses)
 
     def solve(self, right: Float[Array, "k nc"]) -> Float[Array, "k nc"]:
         """`G^-1` times each of `k` vectors."""
-        return self.schur.solve(right)
-
-    @property
-    def _num_columns(self) -> int:
-        return self.schur.tables.transposed.shape[0]
+        return right if self.schur is None else self.schur.solve(right)
 
     def reduced(self, rows: Increment) -> Reduced:
         """The rows of a node, with the coordinate constraints taken out."""
-        if self.frames is None:
+        if self.frames is None or self.schur is None:
             return Reduced(rows, rows.impulse[:0], rows.rate[:0])
         count, num_joints = self.inverse_inertia.shape[0], self.schur.tables.num_rows
         joints, relations = rows.impulse[:num_joints], rows.impulse[num_joints:]
@@ -79,6 +84,6 @@ class DelassusMatrix(eqx.Module):
     def normal_forces(self, impulses: Multipliers) -> Array:
         """The components of `B^T impulses` in the directions of the relations."""
         count = self.inverse_inertia.shape[0]
-        if self.frames is None:
+        if self.frames is None or self.schur is None:
             return impulses[:0]
         return self.schur.transposed(impulses)[count:]

@@ -465,11 +465,11 @@ class SeparableModel(AbstractModel):
     def has_delassus_matrix(self) -> bool:
         return self.constraint_tables is not None
 
-    def delassus_matrix(self, q: Coordinates, t: Time) -> DelassusMatrix:
+    def delassus_matrix(self, state: State) -> DelassusMatrix:
         assert self.constraint_tables is not None
-        frames = self._frames(q)
-        rates, weight = self._rates_of_joints(q, t, frames), self._weight()
-        rest = jnp.zeros((weight.shape[0],), q.dtype)
+        frames = self._frames(state.q)
+        rates, weight = self._rates_of_joints(state.q, state.t, frames), self._weight()
+        rest = jnp.zeros((weight.shape[0],), state.q.dtype)
         rows = schur(self.constraint_tables, rates, rest, weight)
         return DelassusMatrix(self.inverse_inertia, rows, frames)
 

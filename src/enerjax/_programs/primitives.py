@@ -68,6 +68,8 @@ def moved_operands(name: str, count: int) -> tuple[int, ...]:
 REDUCTIONS = _names("reduce_max reduce_min reduce_prod reduce_sum")
 LOGICAL_REDUCTIONS = _names("reduce_and reduce_or")
 PLACES_OF_EXTREMES = _names("argmax argmin")
+# Running sums, products and extremes along an axis.
+CUMULATIVE = _names("cummax cummin cumprod cumsum")
 CONTRACTION = "dot_general"
 
 # Programs within --------------------------------------------------------------------------

@@ -35,6 +35,12 @@ class AbstractCanonicalSystem(AbstractSystem):
         """`H(q, p)` and `qdot = dH/dp`."""
 
     @abc.abstractmethod
+    def inverse_inertia(
+        self, q: Coordinates, p: Coordinates, args: Args
+    ) -> Float[Array, "nq nq"]:
+        """`d2H/dp2`, which can be singular for a general Hamiltonian."""
+
+    @abc.abstractmethod
     def masses(self, q: Coordinates, p: Coordinates, args: Args) -> Coordinates:
         """A mass for each coordinate, by which increments of `q` and `p` are compared."""
 
@@ -82,6 +88,9 @@ class LagrangianSystem(AbstractCanonicalSystem):
         rate = self.velocity(q, p, args)
         return 0.5 * p @ rate + self.potential(q, args), rate
 
+    def inverse_inertia(self, q, p, args):
+        return inverse(self.inertia(State(q, p), args))
+
     def masses(self, q, p, args):
         return jnp.diagonal(self.inertia(State(q, p), args))
 
@@ -120,13 +129,13 @@ class HamiltonianSystem(AbstractCanonicalSystem):
         return self.hamiltonian(state.q, state.v, args)
 
     def inertia(self, state: State, args: Args) -> Float[Array, "nq nq"]:
-        return inverse(self._inverse_inertia(state.q, state.v, args))
+        return inverse(self.inverse_inertia(state.q, state.v, args))
 
-    def _inverse_inertia(self, q: Coordinates, p: Coordinates, args: Args) -> Array:
+    def inverse_inertia(self, q, p, args):
         return jax.hessian(self.hamiltonian, argnums=1)(q, p, args)
 
     def masses(self, q, p, args):
-        return 1 / jnp.diagonal(self._inverse_inertia(q, p, args))
+        return 1 / jnp.diagonal(self.inverse_inertia(q, p, args))
 
     def hamiltonian_and_rate(self, q, p, args):
         return jax.value_and_grad(self.hamiltonian, argnums=1)(q, p, args)

@@ -20,7 +20,15 @@ def step_chord(rows: Increment, delassus: DelassusMatrix) -> Increment:
 
     2 M rate + C^T (impulse - 2 eta) = r_m
     C rate = r_phi,   2 C rate - 2 G eta = r_psi
+
+    Where the momentum `p = M (v1 - v0)` is an unknown too, it solves, with the rows `r_p` of
+    the rates,
+
+    p + C^T impulse = r_m,   rate - M^-1 (p / 2 + C^T eta) = r_p
+    C rate = r_phi,   C M^-1 p = r_psi
     """
+    if rows.momentum.size > 0:
+        return _step_of_momenta(rows, delassus)
     reduced = delassus.reduced(rows)
     inner = reduced.rows
     free = 0.5 * (delassus.inverse_inertia @ inner.rate)
@@ -38,6 +46,24 @@ def step_chord(rows: Increment, delassus: DelassusMatrix) -> Increment:
         impulse=jnp.concatenate([2 * both, relations]),
         rate=delassus.rates(free - delassus.velocity(impulse), reduced),
         momentum=rows.momentum,
+        velocity_impulse=reaction,
+    )
+
+
+def _step_of_momenta(rows: Increment, delassus: DelassusMatrix) -> Increment:
+    """`step_chord` where momenta are unknowns."""
+    free = 0.5 * (delassus.inverse_inertia @ rows.rate)
+    right = [delassus.product(free + rows.momentum) - rows.impulse]
+    is_ggl = rows.velocity_impulse.size > 0
+    if is_ggl:
+        right.append(delassus.product(free) - 0.5 * rows.velocity_impulse)
+    before, *of_rates = delassus.solve(jnp.stack(right))
+    impulse = 2 * (of_rates[0] if is_ggl else before)
+    reaction = of_rates[0] - before if is_ggl else rows.velocity_impulse
+    return Increment(
+        impulse=impulse,
+        rate=free + rows.momentum - delassus.velocity(before),
+        momentum=rows.rate - delassus.force(impulse),
         velocity_impulse=reaction,
     )
 

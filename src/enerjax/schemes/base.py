@@ -231,7 +231,7 @@ class StepProblem(eqx.Module):
     def delassus_matrix(self, end: Increment) -> DelassusMatrix:
         """The Delassus matrix in the middle of the step to `end`."""
         middle = 0.5 * (self.start.q + self.position(end))
-        return self.model.delassus_matrix(middle, self.middle_time)
+        return self.model.delassus_matrix(State(middle, self.start.v, self.middle_time))
 
     def constraint_rows(
         self, z: Increment, state: State, jump: tuple[Increment, State] | None = None
@@ -415,9 +415,13 @@ class AbstractSchemeWithChord(AbstractOneSolveScheme[Z, P], Generic[Z, P]):
     The approximate Jacobian contains the inertia and the gradients of the constraints. It
     differs from the exact one by terms of relative size `h^2` times stiffness divided by
     inertia. Where these are small, the chord method with this matrix converges quickly, and
-    its linear systems have the Delassus matrix `B M^-1 B^T`. It is tried first for systems
-    with constant inertia. Where it fails, the exact Jacobian is used.
+    its linear systems have the Delassus matrix `B M^-1 B^T`. Where it fails, the exact
+    Jacobian is used.
+
+    - `has_chord_of_momenta`: whether `chord` can be used where momenta are unknowns too.
     """
+
+    has_chord_of_momenta: ClassVar[bool] = False
 
     @abc.abstractmethod
     def delassus_matrix(self, z: Z, problem: P) -> DelassusMatrix:

@@ -1,4 +1,4 @@
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -27,8 +27,10 @@ _Unknowns: TypeAlias = Increment | JumpAndEnd
 
 
 class _Problem(eqx.Module):
+    """The data of a step. If `alpha` is known to be zero, nothing is dissipative."""
+
     step: StepProblem
-    dissipative: DissipativeStiffness
+    dissipative: DissipativeStiffness | None
 
 
 class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
@@ -66,7 +68,9 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
 
     **Arguments:**
 
-    - `alpha`: the dissipation, in [0, 1]. It can be traced, swept and differentiated.
+    - `alpha`: the dissipation, in [0, 1]. It can be traced, swept and differentiated. The
+      Python number 0 leaves the dissipation out of the program, which is then shorter; for
+      derivatives with respect to `alpha` at zero, pass `jnp.array(0.0)`.
     - `derivative`: the discrete gradient; `MeanValue()` for the full order.
 
     Raises a `ValueError` for a known `alpha` outside [0, 1] and for a system with
@@ -80,14 +84,17 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
     in Livens form; F. Armero and I. Romero (2001), energy-dissipating schemes.
     """
 
-    alpha: Scalar
+    has_chord_of_momenta: ClassVar[bool] = True
+
+    alpha: Scalar | float
     derivative: AbstractDerivative
     # Determined at construction: under transformations of JAX `alpha` may be traced.
     is_preserving: bool = eqx.field(static=True)
 
     def __init__(self, alpha: Real, derivative: AbstractDerivative = MeanValue(points=2)):
         check_derivative("EnergyConsistent", derivative)
-        self.alpha = as_alpha(alpha)
+        # A Python number is static: it is not traced under `jit`, and has no derivative.
+        self.alpha = 0.0 if _is_number(alpha, 0) else as_alpha(alpha)
         self.derivative = derivative
         # Compared in NumPy, because under `jit` a comparison of JAX arrays is traced.
         self.is_preserving = is_known(self.alpha) and not np.any(np.asarray(self.alpha))
@@ -97,7 +104,8 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
         cls, rho_inf: Real, derivative: AbstractDerivative = MeanValue(points=2)
     ) -> "EnergyConsistent":
         """The scheme with spectral radius `rho_inf`, in [0, 1], at infinite frequency."""
-        return cls(alpha=alpha_from_spectral_radius(rho_inf), derivative=derivative)
+        alpha = 0.0 if _is_number(rho_inf, 1) else alpha_from_spectral_radius(rho_inf)
+        return cls(alpha=alpha, derivative=derivative)
 
     @property
     def formulation(self) -> Formulation:
@@ -125,26 +133,28 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
                 "(directors, or `System.from_hamiltonian`)."
             )
         step = StepProblem(model, start, h, self.derivative)
+        if isinstance(self.alpha, float):
+            return _Problem(step, None)
         return _Problem(step, dissipative_stiffness(step, self._alpha(h)))
 
     def predict(
         self, problem: _Problem, acceleration: Velocities, multipliers: Multipliers
     ) -> _Unknowns:
         guess = problem.step.guess(acceleration, multipliers)
-        if not isinstance(problem.dissipative.matrix, Assembled):
+        dissipative = problem.dissipative
+        if dissipative is None or not isinstance(dissipative.matrix, Assembled):
             return guess
         none = guess.momentum
         return JumpAndEnd(Increment(none, jnp.zeros_like(guess.rate), none, none), guess)
 
     def residual(self, z: _Unknowns, problem: _Problem) -> _Unknowns:
         end, jump = self._end_and_jump(z, problem)
+        step, dissipative = problem.step, problem.dissipative
         if not isinstance(z, JumpAndEnd):
             return self._rows(z, problem, end, jump)
-        step, dissipative, alpha = (
-            problem.step,
-            problem.dissipative,
-            self._alpha(problem.step.h),
-        )
+        assert dissipative is not None
+        assert jump is not None
+        alpha = self._alpha(step.h)
         # (M + tau^2 K+) j_v - (h/6) K+ (dq + tau dv)
         dv = end.v - step.start.v
         moved = step.h * z.end.rate + alpha * step.h / 6 * (dv - alpha * jump)
@@ -174,13 +184,9 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
         return JumpAndEnd(jumps, step_chord(end, delassus))
 
     def finish(self, z: _Unknowns, problem: _Problem) -> StepEnd:
-        step, dissipative, h = problem.step, problem.dissipative, problem.step.h
+        step, h = problem.step, problem.step.h
         end, jump_v = self._end_and_jump(z, problem)
-        z, alpha = _end_of(z), self._alpha(h)
-        dv = self._velocity_change(end, problem)
-        jump_q = -h / 6 * (dv - alpha * jump_v)
-        size = jump_q @ (dissipative.matrix @ jump_q)
-        size = size + jump_v @ (dissipative.inertia @ jump_v)
+        z = _end_of(z)
         drive_work = step.drive_work(step.start, end, z)
         if drive_work is not None:
             skew_work = self._skew_gradient(z, step, end).work
@@ -190,29 +196,48 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
             state=end,
             displacement=h * z.rate,
             multipliers=z.impulse / h,
-            energies=step.account(0.5 * alpha * size, step.step_work(end, z), drive_work),
+            energies=step.account(
+                self._dissipated(problem, end, jump_v), step.step_work(end, z), drive_work
+            ),
         )
 
+    def _dissipated(
+        self, problem: _Problem, end: State, jump_v: Velocities | None
+    ) -> Scalar:
+        dissipative, h = problem.dissipative, problem.step.h
+        if dissipative is None or jump_v is None:
+            return jnp.zeros_like(h)
+        alpha = self._alpha(h)
+        dv = _velocity_change(problem.step, dissipative, end)
+        jump_q = -h / 6 * (dv - alpha * jump_v)
+        size = jump_q @ (dissipative.matrix @ jump_q)
+        return 0.5 * alpha * (size + jump_v @ (dissipative.inertia @ jump_v))
+
     def _rows(
-        self, z: Increment, problem: _Problem, end: State, jump_v: Velocities
+        self, z: Increment, problem: _Problem, end: State, jump_v: Velocities | None
     ) -> Increment:
         step, dissipative, h = problem.step, problem.dissipative, problem.step.h
         gradient = step.discrete_gradient(step.start, end, z)
         gradient = gradient.less(step.step_load(end, z))
         skew = self._skew_gradient(z, step, end)
+        gradient = Gradient(
+            impulse=gradient.impulse - h / 12 * skew.impulse,
+            rate=gradient.rate - h / 12 * skew.rate,
+            rows=gradient.rows,
+        )
+        if dissipative is None or jump_v is None:
+            return step.rows(z, end, gradient)
         # The terms of `P (j(alpha) - j(0))/2` in both components of the gradient.
         force = h**2 / 12 * self._alpha(h) * (dissipative.matrix @ jump_v)
         undamped = dissipative.inverse_inertia @ (dissipative.matrix @ (h**2 / 6 * z.rate))
         rate = step.model.momentum_rows(0.5 * (jump_v - undamped))
-        total = Gradient(
-            impulse=gradient.impulse - h / 12 * skew.impulse + force,
-            rate=gradient.rate - h / 12 * skew.rate + rate,
-            rows=gradient.rows,
-        )
+        total = Gradient(gradient.impulse + force, gradient.rate + rate, gradient.rows)
         return step.rows(z, end, total)
 
-    def _end_and_jump(self, z: _Unknowns, problem: _Problem) -> tuple[State, Velocities]:
-        """The end of the step, and the jump `j_v` of the velocities."""
+    def _end_and_jump(
+        self, z: _Unknowns, problem: _Problem
+    ) -> tuple[State, Velocities | None]:
+        """The end of the step, and the jump `j_v` of the velocities, if there is one."""
         step, dissipative, h = problem.step, problem.dissipative, problem.step.h
         jump_v = z.jump.rate if isinstance(z, JumpAndEnd) else None
         z = _end_of(z)
@@ -223,9 +248,13 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
             curvature, _ = step.model.stiffness_product(
                 self._middle(z, step, start.v), z.impulse / h, (dq, step.duration)
             )
-            force = h / 6 * (curvature - dissipative.matrix @ dq)
             # The row S_mu, solved for v1 - v0. The jump depends on v1 - v0 too.
             right = 2 * (z.rate - start.v - added)
+            if dissipative is None:
+                middle = self._middle(z, step, start.v)
+                inverse_inertia = step.model.inverse_metric(middle)
+                return (start.v + right - inverse_inertia @ (h / 6 * curvature),)
+            force = h / 6 * (curvature - dissipative.matrix @ dq)
             right = right - dissipative.inverse_inertia @ force
             if jump_v is not None:
                 return (start.v + right - jump_v,)
@@ -233,15 +262,10 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
             return (start.v + dissipative.velocity_matrix @ right,)
 
         (end,) = step.nodes(velocity, (z, t1))
-        if jump_v is None:
-            dv = self._velocity_change(end, problem)
+        if dissipative is not None and jump_v is None:
+            dv = _velocity_change(step, dissipative, end)
             jump_v = dissipative.jump_matrix @ (dq + self._alpha(h) * h / 6 * dv)
         return end, jump_v
-
-    def _velocity_change(self, end: State, problem: _Problem) -> Velocities:
-        step, dissipative = problem.step, problem.dissipative
-        change = end.v - step.start.v
-        return step.model.velocity_change(change, dissipative.inverse_inertia)
 
     def _skew_gradient(self, z: Increment, step: StepProblem, end: State) -> Gradient:
         """`D J D (z1 - z0)` at the midpoint; the rows of the coordinates times `h`."""
@@ -254,7 +278,19 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
         return State(step.start.q + 0.5 * step.h * z.rate, v, step.middle_time)
 
     def _alpha(self, like: Scalar) -> Scalar:
-        return self.alpha.astype(like.dtype)
+        return jnp.asarray(self.alpha, like.dtype)
+
+
+def _is_number(x: Real, number: int) -> bool:
+    """Whether `x` is this number of Python; an array is not."""
+    return isinstance(x, int | float) and x == number
+
+
+def _velocity_change(
+    step: StepProblem, dissipative: DissipativeStiffness, end: State
+) -> Velocities:
+    change = end.v - step.start.v
+    return step.model.velocity_change(change, dissipative.inverse_inertia)
 
 
 def _end_of(z: _Unknowns) -> Increment:

@@ -51,6 +51,12 @@ _OF_PAIRS = {
     "reduce_and": lax.and_p,
     "reduce_or": lax.or_p,
 }
+_RUNNING = {
+    "cumsum": lax.add_p,
+    "cumprod": lax.mul_p,
+    "cummax": lax.max_p,
+    "cummin": lax.min_p,
+}
 
 
 class Evaluation:
@@ -106,6 +112,8 @@ class Evaluation:
             return [self._elementwise(primitive, values, params, avals[0])]
         if name in _OF_PAIRS:
             return [self._reduced(_OF_PAIRS[name], values[0], params["axes"], avals[0])]
+        if name in _RUNNING:
+            return [self._running(_RUNNING[name], values[0], params, avals[0])]
         if name == CONTRACTION:
             return [self._contracted(values, params["dimension_numbers"], avals[0])]
         if name in PLACES_OF_EXTREMES:
@@ -139,6 +147,15 @@ class Evaluation:
         return array_of(
             (functools.reduce(pair, row) for row in rows), aval.shape, aval.dtype
         )
+
+    def _running(self, primitive: Any, x: Any, params: Any, aval: Any) -> np.ndarray:
+        x = np.moveaxis(objects(x), params["axis"], -1)
+        turn = slice(None, None, -1 if params["reverse"] else 1)
+        pair = lambda a, b: self.graph.number(primitive, (a, b), {}, aval.dtype)
+        rows = x.reshape(-1, x.shape[-1])[:, turn] if x.size else ()
+        entries = [list(itertools.accumulate(row, pair))[turn] for row in rows]
+        flat = array_of(itertools.chain(*entries), x.shape, aval.dtype)
+        return np.moveaxis(flat, -1, params["axis"])
 
     def _contracted(self, values: list[Any], numbers: Any, aval: Any) -> np.ndarray:
         contracted, batch = numbers

@@ -1,7 +1,7 @@
 """Programs rewritten with primitives that are possible in one function.
 
 Products of matrices become sums of products. Sums of many entries become loops over their
-terms. A scatter to places that are known while the
+terms, and running sums a few sums of shifted arrays. A scatter to places that are known while the
 program is traced, as in the derivative of `x[indices]`, becomes a gather: XLA can gather
 inside of one function, but not scatter.
 """
@@ -22,7 +22,7 @@ from jaxtyping import Array, Int
 
 from ..jaxprs import evaluate, interpret, programs_within, wrapped_program
 from ..numpy_primitives import evaluated
-from ..primitives import CONTRACTION, LINEAR_SOLVE, SCATTERS
+from ..primitives import CONTRACTION, CUMULATIVE, LINEAR_SOLVE, SCATTERS
 from .possible import is_part, is_small_product, LARGEST_SUM, NAME
 from .products import written_out
 
@@ -71,6 +71,8 @@ def _equation(eqn: Any, values: list[Any]) -> list[Any]:
             return [_scattered(name, values, params)]
         if name in _OF_PAIRS:
             return [_reduced(eqn.primitive, jnp.asarray(values[0]), params)]
+        if name in CUMULATIVE:
+            return [_running(_OF_TWO[name], jnp.asarray(values[0]), **params)]
     elif any(map(_needs_rewriting, programs_within(eqn))):
         if name in _LOOPS:
             return _LOOPS[name](values, params)
@@ -94,7 +96,7 @@ def _must_be_replaced(eqn: Any) -> bool:
         return eqn.invars[0].aval.size > LARGEST_SUM
     if is_part(eqn):
         return True
-    return name in (*SCATTERS, LINEAR_SOLVE) or (
+    return name in (*SCATTERS, *CUMULATIVE, LINEAR_SOLVE) or (
         name == CONTRACTION and not is_small_product(eqn)
     )
 
@@ -237,8 +239,32 @@ def _reduced(primitive: Any, x: Array, params: dict[str, Any]) -> Array:
     return out.reshape(shape)
 
 
+# Running sums -----------------------------------------------------------------------------
+
+_OF_TWO: dict[str, Callable[[Any, Any], Any]] = {
+    "cumsum": lax.add,
+    "cumprod": lax.mul,
+    "cummax": lax.max,
+    "cummin": lax.min,
+}
+
+
+def _running(
+    op: Callable[[Any, Any], Any], x: Array, *, axis: int, reverse: bool
+) -> Array:
+    """Each entry joined with all before it, by shifts that double (W. D. Hillis and G. L.
+    Steele, 1986)."""
+    x = jnp.moveaxis(x, axis, 0)
+    x = x[::-1] if reverse else x
+    shift = 1
+    while shift < len(x):
+        x = jnp.concatenate([x[:shift], op(x[:-shift], x[shift:])])
+        shift *= 2
+    return jnp.moveaxis(x[::-1] if reverse else x, 0, axis)
+
+
 # Primitives that this module replaces, where their indices are known and sizes allow it.
-REWRITTEN = SCATTERS | _OF_PAIRS.keys() | {CONTRACTION, LINEAR_SOLVE}
+REWRITTEN = SCATTERS | CUMULATIVE | _OF_PAIRS.keys() | {CONTRACTION, LINEAR_SOLVE}
 
 
 def _picked(flat: Array, source: Array | np.ndarray, shape: tuple[int, ...]) -> Array:

@@ -24,6 +24,7 @@ from ..numpy_primitives import evaluated, moved
 from ..primitives import (
     CONTRACTION,
     CONTROL_FLOW,
+    CUMULATIVE,
     DATA_MOVEMENT,
     ELEMENTWISE,
     moved_operands,
@@ -200,6 +201,21 @@ def _summed(primitive: Any, values: list[_Value], params: Any, avals: Any) -> li
     return [_gathered(value.rows, target, numbers.size)]
 
 
+def _running(primitive: Any, values: list[_Value], params: Any, avals: Any) -> list:
+    """Running sums: each entry joins those before it along an axis."""
+    (value,), axis = values, params["axis"]
+    places = np.moveaxis(np.arange(_entries(value)).reshape(value.shape), axis, 0)
+    places = places[::-1] if params["reverse"] else places
+    if places.size * len(places) > _MAX_ENTRIES:
+        raise _TooDense
+    after, before = np.tril_indices(len(places))
+    pairs = places[after].ravel(), places[before].ravel()
+    joins = scipy.sparse.csr_array(
+        (np.ones(pairs[0].size, bool), pairs), shape=(places.size, places.size)
+    )
+    return [joins @ value.rows]
+
+
 def _gathered(
     rows: "scipy.sparse.csr_array", target: np.ndarray, count: int
 ) -> "scipy.sparse.csr_array":
@@ -286,6 +302,7 @@ _RULES: dict[str, Callable] = {
     **dict.fromkeys(ELEMENTWISE, _elementwise),
     **dict.fromkeys(DATA_MOVEMENT, _moved),
     **dict.fromkeys(REDUCTIONS, _summed),
+    **dict.fromkeys(CUMULATIVE, _running),
     "scatter-add": _added,
     CONTRACTION: _product,
     "jit enerjax_inverse": _each_matrix,
