@@ -41,7 +41,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from .._discrete import AbstractCorrected, AbstractDerivative
-from .._solvers import Assembled, RowPattern, Symmetric
+from .._solvers import Assembled, RowPattern, SchurTables, Symmetric
 from .._system import AbstractSystem, State
 from .._types import (
     Args,
@@ -73,6 +73,8 @@ class AbstractModel(eqx.Module):
     system: eqx.AbstractVar[AbstractSystem]
     args: eqx.AbstractVar[Args]
     scales: eqx.AbstractVar[Scales]
+    # The index tables of `delassus_matrix`; `None` where there is none, or no joints.
+    constraint_tables: eqx.AbstractVar[SchurTables | None]
 
     @property
     @abc.abstractmethod

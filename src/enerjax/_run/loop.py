@@ -14,7 +14,7 @@ from .._operators import AbstractModel, SeparableModel
 from .._programs import in_any_lane
 from .._results import first_failure, may_need_newton, RESULTS
 from .._solvers import ChordAlone, Newton, RootFinder
-from .._system import AbstractSystem, State, System
+from .._system import AbstractSystem, State
 from .._types import Count, Flag, Multipliers, Scalar
 from ..schemes import AbstractScheme, AbstractSchemeWithChord, Energies
 from .event_search import Found, no_search, settle, Watch
@@ -409,7 +409,6 @@ def dispensable_newton(
         or not isinstance(scheme.stage, AbstractSchemeWithChord)
         or not isinstance(plan, EqualPlan)
         or watcher is not None
-        or not isinstance(system, System)
         or system.redundant
     ):
         return None

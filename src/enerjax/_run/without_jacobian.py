@@ -24,7 +24,7 @@ from .._programs import (
     values_of,
 )
 from .._solvers import ChordAlone
-from .._system import State, System
+from .._system import AbstractSystem, State, System
 from .._types import Scalar
 from .loop import dispensable_newton
 from .stage import MOST_BY_NEWTON
@@ -62,8 +62,9 @@ def chord_alone(task: Task, values: Task) -> Task | None:
     )
     if newton is None:
         return None
-    assert isinstance(system, System)
-    if system.constraint is None and system.driven is None:
+    is_separable = isinstance(system, System)
+    has_joints = system.constraint is not None or system.driven is not None
+    if is_separable and not has_joints:
         return None
     experience = _experience(values)
     if experience.needs_newton:
@@ -71,9 +72,9 @@ def chord_alone(task: Task, values: Task) -> Task | None:
     if experience.is_linear is None:
         if _closes_over_unknown_values(system, values):
             return None
-        experience.is_linear = _is_linear(system, values)
+        experience.is_linear = is_separable and _is_linear(system, values)
     # NaN compares false: such a run fails in any program.
-    if not experience.is_linear:
+    if is_separable and not experience.is_linear:
         contraction = values_of(_contraction(values))
         if bool(contraction > _CONTRACTS):
             return None
@@ -95,7 +96,7 @@ def _remembered(structure: Hashable) -> _Experience:
     return _Experience()
 
 
-def _closes_over_unknown_values(system: System, task: Task) -> bool:
+def _closes_over_unknown_values(system: AbstractSystem, task: Task) -> bool:
     """Whether a function of the system has a value in its closure that is not known now.
 
     The result of such a run is traced, so it cannot be known whether the run has failed.
@@ -104,7 +105,7 @@ def _closes_over_unknown_values(system: System, task: Task) -> bool:
     t = jnp.zeros((), start.q.dtype)
 
     def found_by(q: jax.Array, v: jax.Array) -> Any:
-        found = [system.kinetic_energy(State(q, v), args), system.potential(q, args)]
+        found: list[Any] = [system.energy(State(q, v), args)]
         if system.constraint is not None:
             found.append(system.constraint(q, args))
         if system.driven is not None:

@@ -41,6 +41,7 @@ class _Chord(eqx.Module):
     - `contraction`: `defect` divided by the `defect` of the correction before; zero before
       the second correction.
     - `corrections`: the number of corrections so far.
+    - `has_shrunk`: whether a correction has reduced the residual quickly.
     - `done`, `failed`: whether the search has converged, or has stopped without a root.
     """
 
@@ -48,6 +49,7 @@ class _Chord(eqx.Module):
     defect: Scalar
     contraction: Scalar
     corrections: Count
+    has_shrunk: Flag
     done: Flag
     failed: Flag
 
@@ -86,14 +88,19 @@ def chord_iterations(
         # A residual of almost round-off size that stops decreasing is round-off.
         shrinks = contraction < _SHRINKS
         done = done | (~shrinks & (defect <= powers.round_off) & (size <= powers.small))
-        done = done & jnp.isfinite(size)
         stalls = ~shrinks & ~(contraction * before.contraction < _SHRINKS**2)
+        # So is a larger one, if corrections have reduced it and two in a row no longer do:
+        # the inertia of an arm is ill-conditioned, and its rates have few exact digits.
+        is_floor = stalls & before.has_shrunk & (defect <= powers.tiny)
+        done = done | (is_floor & (size <= powers.small))
+        done = done & jnp.isfinite(size)
         late = before.corrections + 1 >= patience
         return _Chord(
             x=x,
             defect=defect,
             contraction=contraction,
             corrections=before.corrections + 1,
+            has_shrunk=before.has_shrunk | (shrinks & (before.corrections > 0)),
             done=done,
             failed=~done & (stalls | late | ~jnp.isfinite(size)),
         )
@@ -103,6 +110,7 @@ def chord_iterations(
         defect=jnp.full((), jnp.inf, guess.dtype),
         contraction=jnp.zeros((), guess.dtype),
         corrections=jnp.array(0),
+        has_shrunk=jnp.array(False),
         done=start.skip,
         failed=~start.by_chord,
     )

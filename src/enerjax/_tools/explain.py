@@ -30,7 +30,7 @@ class Explanation:
       method from the beginning where forces are stiff, with events, with a
       `StepController`, and inside of `jit` and other transformations.
     - `chord`: how the matrix `B M^-1 B^T` of the constraints is eliminated; `None` where
-      the chord method is not used.
+      the chord method is not used, or there are no constraints.
     - `jacobian`: how the exact Jacobian is stored and eliminated.
     - `obstacles`: the operations that keep a step from being one function of machine code,
       with the places where they are called; empty if it is one function.
@@ -161,10 +161,9 @@ def _coordinates(model: AbstractModel, start: State) -> str:
     return model.kinematics.describe(start.q, start.v)
 
 
-def _chord(model: AbstractModel) -> str:
-    assert isinstance(model, SeparableModel)
-    assert model.constraint_tables is not None
-    return model.constraint_tables.description
+def _chord(model: AbstractModel) -> str | None:
+    tables = model.constraint_tables
+    return None if tables is None else tables.description
 
 
 _NAMES = {
