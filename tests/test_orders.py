@@ -175,6 +175,7 @@ def test_the_dissipative_stiffness_is_that_of_half_a_step_of_free_flight():
     step = ej.EnergyConsistent(0.5).problem(make_model(system, start, None), start, h)
     middle = np.array([1.0 + 0.15 * 0.7, -0.4 + 0.15 * 2.0])
     expected = np.diag(3 * np.asarray(k) * middle**2)
+    assert step.dissipative is not None
     found = np.asarray(step.dissipative.matrix)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
 

@@ -10,16 +10,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._discrete import AbstractDerivative
+from .._discrete import AbstractDerivative, ChainRule
 from .._solvers import (
     affine_root,
     as_dense,
     schur,
     schur_tables,
     SchurTables,
+    solve_definite,
     Symmetric,
 )
-from .._system import AbstractCanonicalSystem, State
+from .._system import AbstractCanonicalSystem, LagrangianSystem, State
 from .._types import Args, Coordinates, JointMultipliers, Multipliers, Scalar, Velocities
 from .base import AbstractModel, Reaction
 from .delassus import DelassusMatrix
@@ -41,7 +42,9 @@ class CanonicalModel(AbstractModel):
         state = self.to_internal(state)
         self.scales = self._scales(state)
         rest = jnp.zeros_like(state.q)
-        tables = lambda: schur_tables(self._rates_of_joints(state), rest, self.metric(state))
+        tables = lambda: schur_tables(
+            self._rates_of_joints(state), rest, self.metric(state)
+        )
         self.constraint_tables = None if system.redundant else tables()
 
     @property
@@ -61,8 +64,11 @@ class CanonicalModel(AbstractModel):
     def hamiltonian(self, q: Coordinates, p: Velocities) -> Scalar:
         return self.system.hamiltonian_and_rate(q, p, self.args)[0]
 
+    def _total(self, state: State) -> Scalar:
+        return self.hamiltonian(state.q, state.v)
+
     def kinetic(self, state: State) -> Scalar:
-        return self.hamiltonian(state.q, state.v) - self.potential(state)
+        return self._total(state) - self.potential(state)
 
     def kinetic_change(self, a: State, b: State, gradient: Gradient) -> Scalar:
         return gradient.rate @ (b.v - a.v)
@@ -161,15 +167,20 @@ class CanonicalModel(AbstractModel):
         fixed, driven, nonholonomic = self.split(increment, a.q)
         has_slip_rate = self.has_slip_rate(nonholonomic)
 
+        # The product rule gives that of the kinetic energy without derivatives of inverses.
+        by_product_rule = isinstance(derivative, ChainRule) and isinstance(
+            self.system, LagrangianSystem
+        )
+
         def action(z: Float[Array, " nz"]) -> Scalar:
             q, p = z[:size], z[size:]
-            energy, rate = self.system.hamiltonian_and_rate(q, p, self.args)
-            out = h * energy
+            energy = self.potential if by_product_rule else self._total
+            out = h * energy(State(q, p))
             if has_slip_rate:
-                slip_rate = self.nonholonomic(q) @ rate
+                slip_rate = self.nonholonomic(q) @ self.lift(q, p)
                 out = out + h * nonholonomic.velocity_impulse @ slip_rate
             if fixed.velocity_impulse.size > 0:
-                constraint, psi = jax.jvp(self.fixed, (q,), (rate,))
+                constraint, psi = jax.jvp(self.fixed, (q,), (self.lift(q, p),))
                 return out + fixed.impulse @ constraint + h * fixed.velocity_impulse @ psi
             if fixed.impulse.size > 0:
                 out = out + fixed.impulse @ self.fixed(q)
@@ -194,7 +205,37 @@ class CanonicalModel(AbstractModel):
             terms,
         )
         impulse = self.nonholonomic_impulse(both[:size], a, b, nonholonomic)
-        return Gradient(impulse, both[size:] / h, work)
+        gradient = Gradient(impulse, both[size:] / h, work)
+        if not by_product_rule:
+            return gradient
+        force, rate = self._kinetic_gradient(derivative, a, b)
+        return Gradient(gradient.impulse + h * force, gradient.rate + rate, work)
+
+    def _kinetic_gradient(
+        self, derivative: AbstractDerivative, a: State, b: State
+    ) -> tuple[Coordinates, Coordinates]:
+        """The discrete gradient of `T = p . v / 2`, where `M(q) v = p`, by the product rule.
+
+        With means over the two states and `w = mean(M)^-1 mean(p)`,
+
+            T_b - T_a = (mean(v) + w) / 2 . (p_b - p_a) - w . (M_b - M_a) mean(v) / 2
+        """
+        system = self.system
+        assert isinstance(system, LagrangianSystem)
+        inertias = [system.inertia(state, self.args) for state in (a, b)]
+        before, after = (
+            solve_definite(matrix, state.v)
+            for matrix, state in zip(inertias, (a, b), strict=True)
+        )
+        mean = 0.5 * (before + after)
+        inner = solve_definite(0.5 * (inertias[0] + inertias[1]), 0.5 * (a.v + b.v))
+
+        def product(q: Coordinates) -> Scalar:
+            momentum = lambda v: jax.grad(system.kinetic, argnums=1)(q, v, self.args)
+            return inner @ momentum(mean)
+
+        force = -0.5 * derivative.gradient(product, a.q, b.q)
+        return force, 0.5 * (mean + inner)
 
     def structure(
         self, a: State, b: State, h: Scalar, rate: Coordinates, gradient: Gradient

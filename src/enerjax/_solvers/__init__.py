@@ -17,9 +17,11 @@ from .linear.cholesky_eigh import cholesky as cholesky, eigh as eigh
 from .linear.dense import (
     AbstractFactors as AbstractFactors,
     inverse as inverse,
+    inverse_of_definite as inverse_of_definite,
     product as product,
     SMALL as SMALL,
     solve as solve,
+    solve_definite as solve_definite,
 )
 from .linear.independent_blocks import (
     constant_entries as constant_entries,

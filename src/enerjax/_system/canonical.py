@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._solvers import inverse, solve
+from .._solvers import inverse, inverse_of_definite, solve_definite
 from .._types import Args, Coordinates, Scalar, Velocities
 from .base import (
     AbstractSystem,
@@ -86,10 +86,16 @@ class LagrangianSystem(AbstractCanonicalSystem):
 
     def hamiltonian_and_rate(self, q, p, args):
         rate = self.velocity(q, p, args)
-        return 0.5 * p @ rate + self.potential(q, args), rate
+        energies = lambda q, rate, args: (
+            self.kinetic(q, rate, args),
+            self.potential(q, args),
+        )
+        # The functions of the user may close over traced numbers.
+        energies = eqx.filter_closure_convert(energies, q, rate, args)
+        return _legendre_transform(energies, rate, q, p, args), rate
 
     def inverse_inertia(self, q, p, args):
-        return inverse(self.inertia(State(q, p), args))
+        return inverse_of_definite(self.inertia(State(q, p), args))
 
     def masses(self, q, p, args):
         return jnp.diagonal(self.inertia(State(q, p), args))
@@ -98,7 +104,36 @@ class LagrangianSystem(AbstractCanonicalSystem):
         return jax.grad(self.kinetic, argnums=1)(state.q, state.v, args)
 
     def velocity(self, q: Coordinates, p: Coordinates, args: Args) -> Velocities:
-        return solve(self.inertia(State(q, p), args), p)
+        return solve_definite(self.inertia(State(q, p), args), p)
+
+
+@eqx.filter_custom_jvp
+def _legendre_transform(
+    energies: Callable[[Coordinates, Velocities, Args], tuple[Scalar, Scalar]],
+    rate: Velocities,
+    q: Coordinates,
+    p: Coordinates,
+    args: Args,
+) -> Scalar:
+    """`H(q, p) = p . qdot - T(q, qdot) + V(q)` at the rate `qdot` that belongs to `p`."""
+    _, potential = energies(q, rate, args)
+    return 0.5 * p @ rate + potential
+
+
+@_legendre_transform.def_jvp
+def _legendre_transform_jvp(primals, tangents):
+    # `p . qdot - T` is stationary in the rate, so neither the inertia nor its inverse is
+    # differentiated.
+    energies, rate, q, p, args = primals
+    t_energies, _, t_q, t_p, t_args = tangents
+    _, (kinetic, potential) = eqx.filter_jvp(
+        lambda energies, q, args: energies(q, rate, args),
+        (energies, q, args),
+        (t_energies, t_q, t_args),
+    )
+    change = potential - kinetic
+    change = change if t_p is None else change + rate @ t_p
+    return _legendre_transform(energies, rate, q, p, args), change
 
 
 class HamiltonianSystem(AbstractCanonicalSystem):

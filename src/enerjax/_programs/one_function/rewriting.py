@@ -249,9 +249,7 @@ _OF_TWO: dict[str, Callable[[Any, Any], Any]] = {
 }
 
 
-def _running(
-    op: Callable[[Any, Any], Any], x: Array, *, axis: int, reverse: bool
-) -> Array:
+def _running(op: Callable[[Any, Any], Any], x: Array, *, axis: int, reverse: bool) -> Array:
     """Each entry joined with all before it, by shifts that double (W. D. Hillis and G. L.
     Steele, 1986)."""
     x = jnp.moveaxis(x, axis, 0)

@@ -11,6 +11,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..._programs import LARGEST_SUM, unmerged
@@ -22,6 +23,8 @@ from .norms import largest
 SMALL = 32
 # Rows up to which the loop over columns is unrolled. Longer unrolled loops compile slowly.
 _UNROLLED = 3
+# The same without pivoting, which takes fewer operations.
+_UNROLLED_WITHOUT_PIVOTS = 16
 
 
 def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -88,6 +91,46 @@ def _sums(a: Float[Array, "n n"], b: Float[Array, "n n"]) -> Float[Array, "n n"]
     if a.shape[0] ** 3 > LARGEST_SUM:
         return product(a, b)
     return jnp.sum(a[:, :, None] * b[None], axis=1)
+
+
+def inverse_of_definite(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """The inverse of a symmetric positive definite matrix, in half the operations."""
+    return enerjax_inverse_of_definite(matrix)
+
+
+@jax.jit
+def enerjax_inverse_of_definite(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Found by its name, as `enerjax_inverse` is."""
+    return _inverse_of_definite(matrix)
+
+
+@jax.custom_jvp
+def _inverse_of_definite(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    return jnp.linalg.inv(matrix) if matrix.shape[0] > SMALL else eliminated(matrix)
+
+
+@_inverse_of_definite.defjvp
+def _inverse_of_definite_jvp(primals, tangents):
+    (x,), (dx,) = primals, tangents
+    y = inverse_of_definite(x)
+    return y, -_sums(_sums(y, dx), y)
+
+
+def eliminated(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """The inverse of a positive definite matrix, by in-place elimination; no pivoting."""
+    order = np.arange(matrix.shape[0])
+
+    def column(k: Any, matrix: Array) -> Array:
+        pivot = 1 / matrix[k, k]
+        own = order == k
+        row = jnp.where(own, pivot, matrix[k] * pivot)
+        factors = jnp.where(own, -1, matrix[:, k])
+        left = jnp.where(own[None] | own[:, None], 0, matrix)
+        return left - factors[:, None] * row[None]
+
+    if order.size > _UNROLLED_WITHOUT_PIVOTS:
+        return jax.lax.fori_loop(0, order.size, column, matrix)
+    return functools.reduce(lambda matrix, k: column(k, matrix), order, matrix)
 
 
 class AbstractFactors(eqx.Module):
@@ -183,6 +226,51 @@ def solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array
     if matrix.shape[0] > SMALL:
         return jnp.linalg.solve(matrix, right)
     return inverse(matrix) @ right
+
+
+def solve_definite(
+    matrix: Float[Array, "n n"], right: Float[Array, " n"]
+) -> Float[Array, " n"]:
+    """`matrix^-1 right` for a symmetric positive definite matrix, in few operations."""
+    if matrix.shape[0] > _UNROLLED_WITHOUT_PIVOTS:
+        return solve(matrix, right)
+    return _solve_definite(matrix, right)
+
+
+@jax.custom_jvp
+def _solve_definite(matrix: Array, right: Array) -> Array:
+    return _substituted(_root_free_cholesky(matrix), right)
+
+
+@_solve_definite.defjvp
+def _solve_definite_jvp(primals, tangents):
+    (matrix, right), (d_matrix, d_right) = primals, tangents
+    factors = _root_free_cholesky(matrix)
+    x = _substituted(factors, right)
+    return x, _substituted(factors, d_right - d_matrix @ x)
+
+
+def _root_free_cholesky(matrix: Array) -> tuple[list[Array], list[Array]]:
+    """The pivots, and the columns below the diagonal of the factor, of `L D L^T`."""
+    pivots, columns = [], []
+    for _ in range(matrix.shape[0]):
+        below = matrix[1:, 0]
+        pivots.append(matrix[0, 0])
+        columns.append(below / matrix[0, 0])
+        matrix = matrix[1:, 1:] - columns[-1][:, None] * below[None]
+    return pivots, columns
+
+
+def _substituted(factors: tuple[list[Array], list[Array]], right: Array) -> Array:
+    pivots, columns = factors
+    scaled = []
+    for pivot, column in zip(pivots, columns, strict=True):
+        scaled.append(right[:1] / pivot)
+        right = right[1:] - column * right[0]
+    x = right[:0]
+    for first, column in zip(reversed(scaled), reversed(columns), strict=True):
+        x = jnp.concatenate([first - jnp.sum(column * x), x])
+    return x
 
 
 # The error of an inverse above which it is computed by elimination, and the error that is
