@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import enerjax as ej
+from enerjax._solvers import inverse_of_definite, solve_definite
 from enerjax._solvers.linear.dense import Inverse, inverse
 
 from .helpers import EPS
@@ -42,6 +43,25 @@ def test_pivots_are_the_largest_entries(size, sign):
     exact = np.linalg.inv(matrix)
     bound = 10 * EPS * np.linalg.cond(matrix) * np.max(np.abs(exact))
     np.testing.assert_allclose(inverse(jnp.asarray(matrix)), exact, rtol=0, atol=bound)
+
+
+@pytest.mark.parametrize("size", [1, 2, 7, 20])
+def test_definite_matrices_need_no_pivots(size):
+    root = np.random.default_rng(0).normal(size=(size, size))
+    matrix, right = jnp.asarray(root @ root.T + np.eye(size)), jnp.arange(1.0, 1 + size)
+    change = jnp.asarray(root + root.T)
+
+    def seen(solve):
+        """The solution, and its rates: by the matrix, and by the right-hand side."""
+        by_matrix = jax.jvp(lambda m: solve(m, right), (matrix,), (change,))[1]
+        by_right = jax.vjp(lambda r: solve(matrix, r), right)[1](right)[0]
+        return solve(matrix, right), by_matrix, by_right
+
+    expected = seen(jnp.linalg.solve)
+    for solve in (solve_definite, lambda m, r: inverse_of_definite(m) @ r):
+        for x, y in zip(seen(solve), expected, strict=True):
+            # Round-off, times the condition of the matrix.
+            np.testing.assert_allclose(x, y, rtol=0, atol=1e-10)
 
 
 def test_a_singular_matrix_has_no_inverse():

@@ -12,7 +12,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import enerjax as ej
-from enerjax._operators import SeparableModel
+from enerjax._operators import make_model
 from enerjax._run import without_jacobian
 from enerjax._run.prediction import extrapolated
 from enerjax._solvers import Chord, find_root, Newton, schur, schur_tables
@@ -97,7 +97,8 @@ CHORDS = {
 
 def _left_by_one_correction(scheme, system, start, rng):
     """The sizes of a residual before and after one correction of the chord method."""
-    model = SeparableModel(system, start, None)
+    model = make_model(system, start, None)
+    start = model.to_internal(start)
     problem = scheme.problem(model, start, jnp.asarray(0.1))
     num_constraints = model.scales.constraint.size
     z = scheme.predict(problem, jnp.zeros(start.v.size), jnp.zeros(num_constraints))
@@ -138,6 +139,24 @@ def test_without_stiffness_one_correction_solves_the_step(name, size):
         lambda q, args: jnp.sum(rows * q.reshape(count, 4), axis=1),
     )
     start = ej.initial_state(system, rng.normal(size=size), rng.normal(size=size))
+    before, left = _left_by_one_correction(CHORDS[name], system, start, rng)
+    assert before > 0.1
+    assert left <= 1e4 * EPS  # round-off
+
+
+@pytest.mark.parametrize("joined", [False, True])
+@pytest.mark.parametrize("name", ["preserving", "preserving index3", "consistent 0"])
+def test_with_momenta_one_correction_solves_the_step_too(name, joined):
+    """With a constant inertia, declared as if it varied."""
+    rng = np.random.default_rng(0)
+    root, row = rng.normal(size=(2, 4, 4))
+    inertia = jnp.asarray(root @ root.T + np.eye(4))
+    system = ej.System.from_lagrangian(
+        lambda q, qdot, args: 0.5 * qdot @ inertia @ qdot,
+        lambda q, args: 9.81 * jnp.sum(q),
+        (lambda q, args: jnp.asarray(row[:2]) @ q) if joined else None,
+    )
+    start = ej.initial_state(system, rng.normal(size=4), rng.normal(size=4))
     before, left = _left_by_one_correction(CHORDS[name], system, start, rng)
     assert before > 0.1
     assert left <= 1e4 * EPS  # round-off

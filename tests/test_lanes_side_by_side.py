@@ -79,7 +79,13 @@ def tables(x, y):
     return table[row, 1], table[2, column], one_axis, filled
 
 
-CASES_OF_PROGRAMS = [arithmetic, places, loops, tables]
+def running(x, y):
+    table = jnp.stack([x, y, x * y])
+    back = jax.lax.cumsum(table, axis=1, reverse=True)
+    return jnp.cumsum(table, axis=0), jnp.cumprod(table, axis=1), back, jax.lax.cummin(x)
+
+
+CASES_OF_PROGRAMS = [arithmetic, places, loops, tables, running]
 
 
 @pytest.mark.parametrize("fn", CASES_OF_PROGRAMS, ids=lambda fn: fn.__name__)

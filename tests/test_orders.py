@@ -1,5 +1,6 @@
 """Orders of accuracy, against references in other coordinates and by other methods."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -178,6 +179,24 @@ def test_the_dissipative_stiffness_is_that_of_half_a_step_of_free_flight():
     assert step.dissipative is not None
     found = np.asarray(step.dissipative.matrix)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
+
+
+def test_zero_as_a_python_number_leaves_the_dissipation_out():
+    """The same motion as with an array, which can be differentiated; a number cannot."""
+    system, start, args = ej.problems.double_pendulum()
+    run = lambda scheme: ej.simulate(system, scheme, start, args, h=0.01, num_steps=20)
+    number, array = run(ej.EnergyConsistent(0)), run(ej.EnergyConsistent(jnp.array(0.0)))
+    # Solver and round-off of twenty steps.
+    np.testing.assert_allclose(number.ys.q, array.ys.q, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(number.multipliers, array.multipliers, rtol=0, atol=1e-10)
+    assert np.all(np.asarray(number.audit.dissipated) == 0)
+
+    height = lambda scheme: run(scheme).ys.q[-1, 1]
+    assert eqx.filter_grad(height)(ej.EnergyConsistent(0.0)).alpha is None
+    slope = eqx.filter_grad(height)(ej.EnergyConsistent(jnp.array(0.0))).alpha
+    by_number = jax.grad(lambda alpha: height(ej.EnergyConsistent(alpha)))(0.0)
+    assert abs(slope) > 1e-9
+    assert by_number == pytest.approx(float(slope), rel=1e-9)
 
 
 def test_transformations_keep_the_order():

@@ -33,6 +33,7 @@ BASIC = [
     "REDUCTIONS",
     "LOGICAL_REDUCTIONS",
     "PLACES_OF_EXTREMES",
+    "CUMULATIVE",
     "CALLS",
     "CONTROL_FLOW",
 ]
@@ -69,6 +70,16 @@ def test_moved_entries_keep_the_pattern_sparse(name):
     pattern = jacobian_pattern(fn, x)
     assert pattern is not None
     assert shape_of(pattern) == (fn(x).size, x.size)
+    np.testing.assert_array_equal(pattern.toarray(), jax.jacobian(fn)(x) != 0)
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_running_sums_join_what_is_before(axis, reverse):
+    fn = lambda x: jax.lax.cumsum(x.reshape(2, 3), axis=axis, reverse=reverse).ravel()
+    x = jnp.linspace(0.1, 0.7, 6)
+    pattern = jacobian_pattern(fn, x)
+    assert pattern is not None
     np.testing.assert_array_equal(pattern.toarray(), jax.jacobian(fn)(x) != 0)
 
 

@@ -75,6 +75,12 @@ IN_OTHER_WORDS = {
     "whole numbers": lambda x: x[0].astype(int).at[TWICE].add(3),
     "places": every_place,
     "long sums": lambda x: [f(large(x), axis) for f in SUMS for axis in AXES],
+    "running": lambda x: [
+        f(1 + 0.1 * x, axis=axis)
+        for f in (jnp.cumsum, jnp.cumprod, jax.lax.cummax, jax.lax.cummin)
+        for axis in (0, 1)
+    ],
+    "running back": lambda x: [jax.lax.cumsum(x, axis=1, reverse=True), jnp.cumsum(x[:0])],
     "nothing": lambda x: (2 * x).at[np.zeros(0, int)].add(1.0),
     "slope": jax.grad(lambda x: jnp.sum(jnp.sin(x[:, TWICE] * x) ** 2)),
     "curvature": jax.hessian(lambda x: jnp.sum(jnp.sin(x[ROWS, COLUMNS]) ** 3)),

@@ -214,7 +214,7 @@ class CanonicalModel(AbstractModel):
     def _kinetic_gradient(
         self, derivative: AbstractDerivative, a: State, b: State
     ) -> tuple[Coordinates, Coordinates]:
-        """The discrete gradient of `T = p . v / 2`, where `M(q) v = p`, by the product rule.
+        """The discrete gradient of `T = p . v / 2` with `M(q) v = p`, by the product rule.
 
         With means over the two states and `w = mean(M)^-1 mean(p)`,
 
@@ -301,6 +301,10 @@ class CanonicalModel(AbstractModel):
         rest = jnp.zeros_like(state.q)
         rows = schur(self.constraint_tables, self._rates_of_joints(state), rest, weight)
         return DelassusMatrix(weight, rows, None)
+
+    def _tables(self, state: State) -> SchurTables | None:
+        rest = jnp.zeros_like(state.q)
+        return schur_tables(self._rates_of_joints(state), rest, self.metric(state))
 
     def _rates_of_joints(self, state: State) -> Callable[[Array], JointMultipliers]:
         """The rates of the joints, as a linear function of those of the coordinates."""

@@ -126,11 +126,14 @@ def _legendre_transform_jvp(primals, tangents):
     # differentiated.
     energies, rate, q, p, args = primals
     t_energies, _, t_q, t_p, t_args = tangents
-    _, (kinetic, potential) = eqx.filter_jvp(
+    values, rates = eqx.filter_jvp(
         lambda energies, q, args: energies(q, rate, args),
         (energies, q, args),
         (t_energies, t_q, t_args),
     )
+    # The rate of an energy that does not depend on what moves is `None`.
+    pairs = zip(values, rates, strict=True)
+    kinetic, potential = (jnp.zeros_like(x) if dx is None else dx for x, dx in pairs)
     change = potential - kinetic
     change = change if t_p is None else change + rate @ t_p
     return _legendre_transform(energies, rate, q, p, args), change

@@ -21,8 +21,7 @@ def step_chord(rows: Increment, delassus: DelassusMatrix) -> Increment:
     2 M rate + C^T (impulse - 2 eta) = r_m
     C rate = r_phi,   2 C rate - 2 G eta = r_psi
 
-    Where the momentum `p = M (v1 - v0)` is an unknown too, it solves, with the rows `r_p` of
-    the rates,
+    Where the momentum `p` is an unknown too, with the rows `r_p` of the rates, it solves
 
     p + C^T impulse = r_m,   rate - M^-1 (p / 2 + C^T eta) = r_p
     C rate = r_phi,   C M^-1 p = r_psi
