@@ -83,6 +83,25 @@ def test_running_sums_join_what_is_before(axis, reverse):
     np.testing.assert_array_equal(pattern.toarray(), jax.jacobian(fn)(x) != 0)
 
 
+SPARSE = np.array([[0.0, 2.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 3.0], [0.0, 4.0, 5.0]])
+PRODUCTS = {
+    "left": lambda x: SPARSE @ x,
+    "right": lambda x: x.T @ SPARSE.T,
+    "batch": lambda x: jnp.einsum("ki,kj->kij", x, np.eye(3)),
+    "batch first": lambda x: jnp.einsum("kj,ki->kij", np.eye(3), x),
+    "both": lambda x: jnp.einsum("nkj,kl->nlj", jnp.stack([x, x[::-1]]), SPARSE.T),
+}
+
+
+@pytest.mark.parametrize("name", PRODUCTS)
+def test_known_zeros_of_products_keep_the_pattern_sparse(name):
+    fn = lambda x: jnp.ravel(PRODUCTS[name](x.reshape(3, 2)))
+    x = jnp.linspace(0.1, 0.7, 6)
+    pattern = jacobian_pattern(fn, x)
+    assert pattern is not None
+    np.testing.assert_array_equal(pattern.toarray(), jax.jacobian(fn)(x) != 0)
+
+
 ROWS = np.array([2, 0, 1])
 # Programs with indices, which are evaluated with NumPy while others are traced.
 WITH_INDICES = {

@@ -3,6 +3,7 @@
 With JAX itself every primitive would compile a program for every new shape.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +11,13 @@ import numpy as np
 
 from .jaxprs import evaluate, interpret
 from .primitives import JIT
+
+
+def as_rows(x: np.ndarray, contracted: Any, batch: Any) -> np.ndarray:
+    """A factor of `dot_general` as (batch, free, contracted)."""
+    free = [k for k in range(x.ndim) if k not in (*contracted, *batch)]
+    sizes = [math.prod(x.shape[k] for k in axes) for axes in (batch, free, contracted)]
+    return np.transpose(x, (*batch, *free, *contracted)).reshape(sizes)
 
 
 def _broadcast_in_dim(x, *, shape, broadcast_dimensions, **_):

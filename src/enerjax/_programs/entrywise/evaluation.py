@@ -2,7 +2,6 @@
 
 import functools
 import itertools
-import math
 from typing import Any
 
 import jax
@@ -12,7 +11,7 @@ from jax import lax
 from jax.core import Tracer
 
 from ..jaxprs import has_numbers, interpret, wrapped_program
-from ..numpy_primitives import evaluated, is_inside, moved
+from ..numpy_primitives import as_rows, evaluated, is_inside, moved
 from ..one_function.possible import NAME
 from ..one_function.rewriting import places_of_updates
 from ..primitives import (
@@ -160,7 +159,7 @@ class Evaluation:
     def _contracted(self, values: list[Any], numbers: Any, aval: Any) -> np.ndarray:
         contracted, batch = numbers
         left, right = (
-            _as_rows(objects(x), *axes)
+            as_rows(objects(x), *axes)
             for x, axes in zip(values, zip(contracted, batch, strict=True), strict=True)
         )
         zero = np.dtype(aval.dtype).type(0)
@@ -309,13 +308,6 @@ def _is_plain(aval: Any) -> bool:
 
 def _is_unknown(x: Any) -> bool:
     return np.asarray(x).dtype == object
-
-
-def _as_rows(x: np.ndarray, contracted: Any, batch: Any) -> np.ndarray:
-    """An operand as (batch, free, contracted)."""
-    free = [k for k in range(x.ndim) if k not in (*contracted, *batch)]
-    sizes = [math.prod(x.shape[k] for k in axes) for axes in (batch, free, contracted)]
-    return np.transpose(x, (*batch, *free, *contracted)).reshape(sizes)
 
 
 def _updated(x: Any, update: Any, *starts: Any, aval: Any) -> np.ndarray:

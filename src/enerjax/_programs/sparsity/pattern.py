@@ -10,6 +10,7 @@ one matrix for each output, with one row of unknowns for each entry.
 """
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
@@ -20,7 +21,7 @@ import scipy
 from jaxtyping import Array
 
 from ..jaxprs import evaluate, interpret, is_known, name_of, wrapped_program
-from ..numpy_primitives import evaluated, moved
+from ..numpy_primitives import as_rows, evaluated, moved
 from ..primitives import (
     CONTRACTION,
     CONTROL_FLOW,
@@ -261,6 +262,8 @@ def _product(primitive: Any, values: list[_Value], params: Any, avals: Any) -> l
     for side, value in enumerate(values):
         if not isinstance(value, _Depends):
             continue
+        if not isinstance(values[1 - side], _Constant | _Depends):
+            return [_product_with_known(values, params["dimension_numbers"], side)]
         # The axes of this side in the order of the output: batch axes, then free ones.
         free = [
             k for k in range(len(value.shape)) if k not in (*contracted[side], *batch[side])
@@ -278,6 +281,29 @@ def _product(primitive: Any, values: list[_Value], params: Any, avals: Any) -> l
         rows = united[np.broadcast_to(numbers.reshape(shape), aval.shape).ravel()]
         out = rows if out is None else out + rows
     return [out]
+
+
+def _product_with_known(values: list[_Value], numbers: Any, side: int) -> Any:
+    """`dot_general` with a factor whose zeros are known."""
+    contracted, batch = numbers
+    value, factor = values[side], np.asarray(values[1 - side]) != 0
+    entries = np.arange(_entries(value)).reshape(value.shape)
+    own = as_rows(entries, contracted[side], batch[side])
+    other = as_rows(factor, contracted[1 - side], batch[1 - side])
+    part, place, term = np.nonzero(other)
+    if own.shape[1] * place.size > _MAX_ENTRIES:
+        raise _TooDense
+    free = np.arange(own.shape[1])
+    source = own[part[:, None], free, term[:, None]]
+    sizes = (own.shape[1], other.shape[1]) if side == 0 else (other.shape[1], own.shape[1])
+    pair = (free, place[:, None]) if side == 0 else (place[:, None], free)
+    target = (part[:, None] * sizes[0] + pair[0]) * sizes[1] + pair[1]
+    count = len(own) * math.prod(sizes)
+    ones = np.ones(source.size, bool)
+    joins = scipy.sparse.csr_array(
+        (ones, (target.ravel(), source.ravel())), shape=(count, entries.size)
+    )
+    return joins @ value.rows
 
 
 def _everything(primitive: Any, values: list[_Value], params: Any, avals: Any) -> list:
