@@ -157,6 +157,14 @@ def car_axis(m, h, **options):
     )
 
 
+def angles(m, h, **options):
+    system, start, args = ej.problems.double_pendulum_angles()
+    args = args | dict(m1=args["m1"] * m)
+    return ej.simulate(
+        system, options.pop("scheme"), start, args, h=h, throw=False, **options
+    )
+
+
 def parameters():
     return jnp.linspace(0.5, 2.0, LANES), 1e-3 * jnp.linspace(0.5, 1.5, LANES)
 
@@ -168,6 +176,8 @@ CASES = {
     "composed": (double_pendulum, ej.Composed(ej.EnergyPreserving(), 4)),
     "rattle": (double_pendulum, ej.Rattle()),
     "axis": (car_axis, ej.EnergyPreserving()),
+    "angles": (angles, ej.EnergyPreserving()),
+    "angles consistent": (angles, ej.EnergyConsistent(0.5)),
 }
 
 

@@ -118,10 +118,6 @@ class SeparableModel(AbstractModel):
         self.constraint_tables = self._constraint_tables(state)
 
     def with_known_zeros(self, state: State) -> "SeparableModel":
-        """The model, with known numbers in place of what is zero in every inertia.
-
-        `state` is any state of the model.
-        """
         system, kind, args = self.system, self.kinematics, self.args
         user = kind.user_velocity(state.q, state.v)
         inertia = lambda: kind.inertia(

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from .._operators import AbstractModel, SeparableModel
+from .._operators import AbstractModel
 from .._programs import in_any_lane
 from .._results import first_failure, may_need_newton, RESULTS
 from .._solvers import ChordAlone, Newton, RootFinder
@@ -21,7 +21,7 @@ from .event_search import Found, no_search, settle, Watch
 from .halving import select
 from .reverse import keep_roots, LoopBody, loops
 from .saving import Begin, Costs, Record, with_time
-from .stage import num_unknowns
+from .stage import has_chord, num_unknowns
 from .step import advance, first_warm, model_for, StepOutput, Warm
 from .step_sizes import AbstractPlan, EqualPlan, Verdict
 from .watcher import Happening, Watcher
@@ -434,7 +434,7 @@ def for_lanes(stepper: Stepper, begin: Progress) -> Callable[[], Stepper] | None
     if (
         newton is None
         or not stepper.may_have_lanes
-        or not (isinstance(model, SeparableModel) and model.has_delassus_matrix)
+        or not has_chord(stepper.scheme.stage, model)
         or _num_unknowns(begin) > _MANY_IN_LANES
     ):
         return None
