@@ -177,6 +177,7 @@ CASES = {
     "rattle": (double_pendulum, ej.Rattle()),
     "axis": (car_axis, ej.EnergyPreserving()),
     "angles": (angles, ej.EnergyPreserving()),
+    "angles decaying": (angles, ej.EnergyDecaying(0.5)),
     "angles consistent": (angles, ej.EnergyConsistent(0.5)),
 }
 

@@ -166,9 +166,7 @@ def solve(
 
 def has_chord(scheme: AbstractOneSolveScheme, model: AbstractModel) -> bool:
     """Whether the step equations have a chord method."""
-    if not (isinstance(scheme, AbstractSchemeWithChord) and model.has_delassus_matrix):
-        return False
-    return scheme.has_chord_of_momenta or not model.has_own_momenta
+    return isinstance(scheme, AbstractSchemeWithChord) and model.has_delassus_matrix
 
 
 def is_chord_alone(

@@ -5,13 +5,14 @@ all terms of the stiffness. The right-hand sides are the rows of the balance of 
 `r_m`, the constraints divided by `h`, `r_phi`, and their rates `r_psi`. After block
 elimination each kind of multiplier has a linear system with the matrix `G = C M^-1 C^T`.
 Coordinate constraints are taken out first, and their multipliers follow from the normal
-components of the balance of momentum.
+components of the balance of momentum. Where momenta are unknowns, they are taken out too.
 """
 
+import equinox as eqx
 import jax.numpy as jnp
 
 from .._operators import DelassusMatrix, Increment
-from .._types import Scalar
+from .._types import Scalar, Velocities
 from ._discontinuous import JumpAndEnd
 
 
@@ -21,13 +22,11 @@ def step_chord(rows: Increment, delassus: DelassusMatrix) -> Increment:
     2 M rate + C^T (impulse - 2 eta) = r_m
     C rate = r_phi,   2 C rate - 2 G eta = r_psi
 
-    Where the momentum `p` is an unknown too, with the rows `r_p` of the rates, it solves
-
-    p + C^T impulse = r_m,   rate - M^-1 (p / 2 + C^T eta) = r_p
-    C rate = r_phi,   C M^-1 p = r_psi
     """
     if rows.momentum.size > 0:
-        return _step_of_momenta(rows, delassus)
+        found = step_chord(_without_momenta(rows, delassus), delassus)
+        momentum = rows.rate - delassus.force(found.impulse)
+        return _with_momenta(found, rows, momentum)
     reduced = delassus.reduced(rows)
     inner = reduced.rows
     free = 0.5 * (delassus.inverse_inertia @ inner.rate)
@@ -49,22 +48,24 @@ def step_chord(rows: Increment, delassus: DelassusMatrix) -> Increment:
     )
 
 
-def _step_of_momenta(rows: Increment, delassus: DelassusMatrix) -> Increment:
-    """`step_chord` where momenta are unknowns."""
-    free = 0.5 * (delassus.inverse_inertia @ rows.rate)
-    right = [delassus.product(free + rows.momentum) - rows.impulse]
-    is_ggl = rows.velocity_impulse.size > 0
-    if is_ggl:
-        right.append(delassus.product(free) - 0.5 * rows.velocity_impulse)
-    before, *of_rates = delassus.solve(jnp.stack(right))
-    impulse = 2 * (of_rates[0] if is_ggl else before)
-    reaction = of_rates[0] - before if is_ggl else rows.velocity_impulse
-    return Increment(
-        impulse=impulse,
-        rate=free + rows.momentum - delassus.velocity(before),
-        momentum=rows.rate - delassus.force(impulse),
-        velocity_impulse=reaction,
-    )
+def _without_momenta(rows: Increment, delassus: DelassusMatrix) -> Increment:
+    """The rows of a node for `rate - r_p`, where `r_p` are those of its momenta.
+
+    With the momenta `p1` of a step as unknowns, for example, its rows `S_mu` are
+
+        rate - M^-1 (p1 / 2 + C^T eta) = r_p
+
+    so `2 (rate - r_p - M^-1 C^T eta)` is the velocity that belongs to `p1`.
+    """
+    parts = lambda rows: (rows.impulse, rows.momentum)
+    impulse = rows.impulse - delassus.product(rows.momentum)
+    return eqx.tree_at(parts, rows, (impulse, rows.momentum[:0]))
+
+
+def _with_momenta(found: Increment, rows: Increment, momentum: Velocities) -> Increment:
+    """The correction of a node from that for `rate - r_p`."""
+    parts = lambda found: (found.rate, found.momentum)
+    return eqx.tree_at(parts, found, (found.rate + rows.momentum, momentum))
 
 
 def rattle_chord(rows: Increment, delassus: DelassusMatrix) -> Increment:
@@ -94,6 +95,18 @@ def jump_chord(alpha: Scalar, rows: JumpAndEnd, delassus: DelassusMatrix) -> Jum
     It solves `M v1 + C^T impulse_1 = r_1` and `M vj - C^T (impulse_1 - impulse_j)/3 = r_j`,
     with the rows of the constraints at both nodes.
     """
+    if rows.end.momentum.size > 0:
+        shifted = JumpAndEnd(
+            *(_without_momenta(x, delassus) for x in (rows.jump, rows.end))
+        )
+        found = jump_chord(alpha, shifted, delassus)
+        force, force_j = (delassus.force(x.impulse) for x in (found.end, found.jump))
+        return JumpAndEnd(
+            jump=_with_momenta(
+                found.jump, rows.jump, rows.jump.rate + (force - force_j) / 3
+            ),
+            end=_with_momenta(found.end, rows.end, rows.end.rate - force),
+        )
     alpha = alpha.astype(rows.end.rate.dtype)
     of_jump, of_end = delassus.reduced(rows.jump), delassus.reduced(rows.end)
     jump, end = of_jump.rows, of_end.rows

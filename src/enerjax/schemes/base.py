@@ -417,11 +417,7 @@ class AbstractSchemeWithChord(AbstractOneSolveScheme[Z, P], Generic[Z, P]):
     inertia. Where these are small, the chord method with this matrix converges quickly, and
     its linear systems have the Delassus matrix `B M^-1 B^T`. Where it fails, the exact
     Jacobian is used.
-
-    - `has_chord_of_momenta`: whether `chord` can be used where momenta are unknowns too.
     """
-
-    has_chord_of_momenta: ClassVar[bool] = False
 
     @abc.abstractmethod
     def delassus_matrix(self, z: Z, problem: P) -> DelassusMatrix:

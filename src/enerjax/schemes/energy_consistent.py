@@ -1,4 +1,4 @@
-from typing import ClassVar, TypeAlias
+from typing import TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -83,8 +83,6 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
     constraints; P. L. Kinon, P. Betsch and S. Schneider (2023), energy-momentum schemes
     in Livens form; F. Armero and I. Romero (2001), energy-dissipating schemes.
     """
-
-    has_chord_of_momenta: ClassVar[bool] = True
 
     alpha: Scalar | float
     derivative: AbstractDerivative

@@ -1,5 +1,3 @@
-from typing import ClassVar
-
 import equinox as eqx
 import jax.numpy as jnp
 
@@ -40,8 +38,6 @@ class EnergyPreserving(AbstractSchemeWithRotations[Increment, StepProblem]):
     the stabilisation of C. W. Gear, B. Leimkuhler and G. K. Gupta (1985). Rotations: J. C.
     Simo and K. K. Wong (1991), with discrete gradients of any potential and constraints.
     """
-
-    has_chord_of_momenta: ClassVar[bool] = True
 
     formulation: Formulation = eqx.field(  # pyright: ignore[reportIncompatibleMethodOverride]
         default="ggl", static=True
