@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from .dense import product
+from .dense import order_after, product
 
 
 # Columns from which LAPACK is faster than plain operations.
@@ -43,7 +43,8 @@ def apply_reduction(
 def _by_lapack(panel: Float[Array, "m w"]) -> tuple[Array, Array]:
     """From `P rows = [L1; L2] U`: the reduction is `[(L1 U)^-1; -L2 L1^-1]`."""
     count = panel.shape[1]
-    panel, _, order = jax.lax.linalg.lu(panel)
+    panel, pivots, _ = jax.lax.linalg.lu(panel)
+    order = order_after(pivots, len(panel))
     own, below = panel[:count], panel[count:]
     solve = jax.lax.linalg.triangular_solve
     eye = jnp.eye(count, dtype=panel.dtype)
