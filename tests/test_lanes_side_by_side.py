@@ -85,7 +85,15 @@ def running(x, y):
     return jnp.cumsum(table, axis=0), jnp.cumprod(table, axis=1), back, jax.lax.cummin(x)
 
 
-CASES_OF_PROGRAMS = [arithmetic, places, loops, tables, running]
+def factors(x, y):
+    matrix = jnp.diag(4 + y) + x[:, None] * jnp.roll(x, 1)[None] / 9
+    definite = matrix @ matrix.T
+    root = jnp.linalg.cholesky(definite)
+    half = jax.scipy.linalg.solve_triangular(root, x, lower=True)
+    return root, half, jnp.linalg.solve(matrix, y), jnp.sort(x), jnp.linalg.inv(definite)
+
+
+CASES_OF_PROGRAMS = [arithmetic, places, loops, tables, running, factors]
 
 
 @pytest.mark.parametrize("fn", CASES_OF_PROGRAMS, ids=lambda fn: fn.__name__)
@@ -112,7 +120,7 @@ def test_programs_entry_by_entry(fn):
 def test_what_lanes_cannot_do_is_left_to_other_programs():
     table, key = jnp.arange(9.0).reshape(3, 3), jax.random.key(0)
     for fn in (
-        lambda x: jnp.linalg.cholesky(jnp.outer(x, x)),
+        lambda x: jnp.linalg.eigh(jnp.outer(x, x))[1],
         lambda x: table[jnp.where(x[0] > 0, 1, 2), jnp.where(x[1] > 0, 1, 2)],
         lambda x: jnp.take(x, jnp.array([0, 3])),
         lambda x: (x, jax.debug.print("a lane"))[0] + 1,

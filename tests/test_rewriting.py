@@ -63,6 +63,50 @@ def of_loops(x):
     ]
 
 
+def sorting(x):
+    """With equal entries, which keep their order, and with entries that are no numbers."""
+    ties = jnp.round(2 * x)
+    broken = jnp.where(x > 0.9, jnp.nan, jnp.where(x < -0.9, jnp.inf, x))
+    return [
+        *(jnp.sort(x, axis=axis) for axis in (0, 1)),
+        *(jnp.argsort(y, axis=1) for y in (ties, -ties, broken)),
+        jax.lax.sort((ties, x), dimension=0, num_keys=1)[1],
+        jnp.argsort(TWICE + (4 * x[0]).astype(int)),
+    ]
+
+
+def definite(x):
+    return x @ x.T + jnp.eye(3)
+
+
+def factors(x):
+    square = x[:, :3] + jnp.array([[0.0, 2.0, 0.0], [0.0, 0.0, 3.0], [1.0, 0.0, 0.0]])
+    both = jnp.stack([square, square.T])
+    return [
+        jnp.linalg.cholesky(definite(x)),
+        jnp.linalg.det(both),
+        jnp.linalg.slogdet(square)[1],
+        jnp.linalg.inv(both),
+        jax.lax.linalg.lu(jnp.exp(x * x))[0],
+        *(y.astype(x.dtype) for y in jax.lax.linalg.lu(jnp.exp(x * x).T)),
+    ]
+
+
+def solutions(x):
+    lower, upper = jnp.tril(definite(x)), jnp.triu(definite(x))
+    solve = jax.scipy.linalg.solve_triangular
+    right = jax.lax.linalg.triangular_solve
+    return [
+        jnp.linalg.solve(x[:, :3] + 2 * jnp.eye(3)[::-1], x),
+        solve(lower, x, lower=True),
+        solve(upper, x, trans=1, unit_diagonal=True),
+        solve(upper, x[:, 0]),
+        right(lower, x.T, lower=True),
+        right(lower, x.T, lower=True, transpose_a=True),
+        jax.scipy.linalg.cho_solve((lower, True), x),
+    ]
+
+
 IN_OTHER_WORDS = {
     "put": lambda x: x.at[ROWS, COLUMNS].set(jnp.cos(x[:2, :2])),
     "put twice": lambda x: x.at[:, TWICE].set(1 + 0 * x),
@@ -81,6 +125,9 @@ IN_OTHER_WORDS = {
         for axis in (0, 1)
     ],
     "running back": lambda x: [jax.lax.cumsum(x, axis=1, reverse=True), jnp.cumsum(x[:0])],
+    "sorted": sorting,
+    "factors": factors,
+    "solutions": solutions,
     "nothing": lambda x: (2 * x).at[np.zeros(0, int)].add(1.0),
     "slope": jax.grad(lambda x: jnp.sum(jnp.sin(x[:, TWICE] * x) ** 2)),
     "curvature": jax.hessian(lambda x: jnp.sum(jnp.sin(x[ROWS, COLUMNS]) ** 3)),

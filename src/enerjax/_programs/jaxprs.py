@@ -119,6 +119,16 @@ def programs_within(equation: Any) -> Iterator[Jaxpr]:
     yield from _programs(params.values())
 
 
+def solution_program(
+    values: list[Any], params: dict[str, Any]
+) -> tuple[ClosedJaxpr, list[Any]]:
+    """The program by which `jax.lax.custom_linear_solve` solves, and its inputs."""
+    counts = params["const_lengths"]
+    first = counts.matvec + counts.vecmat
+    consts = values[first : first + counts.solve]
+    return params["jaxprs"].solve, [*consts, *values[sum(counts) :]]
+
+
 def _programs(params: Any) -> Iterator[Jaxpr]:
     for param in params:
         if isinstance(param, ClosedJaxpr):

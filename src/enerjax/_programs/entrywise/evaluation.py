@@ -10,15 +10,17 @@ import numpy as np
 from jax import lax
 from jax.core import Tracer
 
-from ..jaxprs import has_numbers, interpret, wrapped_program
+from ..jaxprs import has_numbers, interpret, solution_program, wrapped_program
 from ..numpy_primitives import as_rows, evaluated, is_inside, moved
 from ..one_function.possible import NAME
 from ..one_function.rewriting import places_of_updates
+from ..one_function.small_matrices import in_plain_operations, is_small, PLAIN
 from ..primitives import (
     COMPONENTS,
     CONTRACTION,
     DATA_MOVEMENT,
     ELEMENTWISE,
+    LINEAR_SOLVE,
     PLACES_OF_EXTREMES,
     SCATTERS,
 )
@@ -91,6 +93,8 @@ class Evaluation:
             return self.outputs(params["program"].jaxpr, values)
         if name == "custom_vmap_call":
             return self.closed(params["call"], values)
+        if name == LINEAR_SOLVE:
+            return self.closed(*solution_program(values, params))
         if any(isinstance(x.flat[0], Stack) for x in values if _is_unknown(x) and x.size):
             raise UnsupportedError(f"{name} of all passes of a loop")
         if name in LOOPS:
@@ -111,6 +115,10 @@ class Evaluation:
             return [self._elementwise(primitive, values, params, avals[0])]
         if name in _OF_PAIRS:
             return [self._reduced(_OF_PAIRS[name], values[0], params["axes"], avals[0])]
+        if name in PLAIN and is_small(eqn):
+            plain = lambda *values: in_plain_operations(name, list(values), params)
+            like = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in eqn.invars]
+            return self.closed(jax.make_jaxpr(plain)(*like), values)
         if name in _RUNNING:
             return [self._running(_RUNNING[name], values[0], params, avals[0])]
         if name == CONTRACTION:

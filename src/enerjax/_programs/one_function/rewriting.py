@@ -1,9 +1,10 @@
 """Programs rewritten with primitives that are possible in one function.
 
 Products of matrices become sums of products. Sums of many entries become loops over their
-terms, and running sums become a few sums of shifted arrays. A scatter to places that are
-known while the program is traced, as in the derivative of `x[indices]`, becomes a gather:
-XLA can gather inside of one function, but not scatter.
+terms, and running sums become a few sums of shifted arrays. Factors of small matrices are
+found by plain operations; see `small_matrices.py`. A scatter to places that are known while
+the program is traced, as in the derivative of `x[indices]`, becomes a gather: XLA can
+gather inside of one function, but not scatter.
 """
 
 import functools
@@ -20,11 +21,18 @@ from jax.extend.core import ClosedJaxpr, Literal
 from jax.extend.core.primitives import reduce_sum_p
 from jaxtyping import Array, Int
 
-from ..jaxprs import evaluate, interpret, programs_within, wrapped_program
+from ..jaxprs import (
+    evaluate,
+    interpret,
+    programs_within,
+    solution_program,
+    wrapped_program,
+)
 from ..numpy_primitives import evaluated
 from ..primitives import CONTRACTION, CUMULATIVE, LINEAR_SOLVE, SCATTERS
 from .possible import is_part, is_small_product, LARGEST_SUM, NAME
 from .products import written_out
+from .small_matrices import in_plain_operations, is_small, PLAIN
 
 
 def rewritten(jaxpr: Any, known: Sequence[np.ndarray | None]) -> ClosedJaxpr:
@@ -63,7 +71,8 @@ def _equation(eqn: Any, values: list[Any]) -> list[Any]:
             count = len(program.jaxpr.constvars)
             return interpret(program.jaxpr, values[:count], values[count:], _equation)
         if name == LINEAR_SOLVE:
-            return _of_linear_solve(values, params)
+            program, inputs = solution_program(values, params)
+            return interpret(program.jaxpr, program.consts, inputs, _equation)
         if name == CONTRACTION and eqn.outvars[0].aval.size <= LARGEST_SUM:
             left, right = values
             return [written_out(left, right, params["dimension_numbers"])]
@@ -73,6 +82,8 @@ def _equation(eqn: Any, values: list[Any]) -> list[Any]:
             return [_reduced(eqn.primitive, jnp.asarray(values[0]), params)]
         if name in CUMULATIVE:
             return [_running(_OF_TWO[name], jnp.asarray(values[0]), **params)]
+        if name in PLAIN:
+            return in_plain_operations(name, list(map(jnp.asarray, values)), params)
     elif any(map(_needs_rewriting, programs_within(eqn))):
         if name in _LOOPS:
             return _LOOPS[name](values, params)
@@ -96,6 +107,8 @@ def _must_be_replaced(eqn: Any) -> bool:
         return eqn.invars[0].aval.size > LARGEST_SUM
     if is_part(eqn):
         return True
+    if name in PLAIN:
+        return is_small(eqn)
     return name in (*SCATTERS, *CUMULATIVE, LINEAR_SOLVE) or (
         name == CONTRACTION and not is_small_product(eqn)
     )
@@ -107,15 +120,6 @@ def _needs_rewriting(jaxpr: Any) -> bool:
         for eqn in jaxpr.eqns
         if is_part(eqn) or eqn.primitive.name != NAME
     )
-
-
-def _of_linear_solve(values: list[Any], params: dict[str, Any]) -> list[Any]:
-    """The solution that `jax.lax.custom_linear_solve` finds, without its derivatives."""
-    counts, program = params["const_lengths"], params["jaxprs"].solve
-    first = counts.matvec + counts.vecmat
-    consts = values[first : first + counts.solve]
-    right = values[sum(counts) :]
-    return interpret(program.jaxpr, program.consts, [*consts, *right], _equation)
 
 
 # Loops and branches -----------------------------------------------------------------------
@@ -262,7 +266,7 @@ def _running(op: Callable[[Any, Any], Any], x: Array, *, axis: int, reverse: boo
 
 
 # Primitives that this module replaces, where their indices are known and sizes allow it.
-REWRITTEN = SCATTERS | CUMULATIVE | _OF_PAIRS.keys() | {CONTRACTION, LINEAR_SOLVE}
+REWRITTEN = SCATTERS | CUMULATIVE | PLAIN | _OF_PAIRS.keys() | {CONTRACTION, LINEAR_SOLVE}
 
 
 def _picked(flat: Array, source: Array | np.ndarray, shape: tuple[int, ...]) -> Array:

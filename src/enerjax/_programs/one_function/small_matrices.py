@@ -1,0 +1,160 @@
+"""Sorting, and factors of small matrices, in operations that are possible in one function.
+
+XLA calls a library for them. Here they cost more operations, which are fewer than such a
+call costs, and the calls would also divide the program around them.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+
+# The number of rows up to which matrices are small, and that of entries which are sorted.
+_MOST_ROWS, _MOST_SORTED = 16, 32
+
+
+def _cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """The lower factor, with zeros above the diagonal."""
+    columns = []
+    for k in range(matrix.shape[0]):
+        column = matrix[:, 0] / jnp.sqrt(matrix[0, 0])
+        columns.append(jnp.pad(column, (k, 0)))
+        matrix = matrix[1:, 1:] - column[1:, None] * column[None, 1:]
+    return jnp.stack(columns, axis=1)
+
+
+def _substituted(
+    matrix: Float[Array, "n n"], right: Float[Array, "n k"], is_unit: bool
+) -> Float[Array, "n k"]:
+    """The solution for a lower triangular matrix."""
+    rows = []
+    for k in range(matrix.shape[0]):
+        row = right[:1] if is_unit else right[:1] / matrix[k, k]
+        rows.append(row)
+        right = right[1:] - matrix[k + 1 :, k, None] * row
+    return jnp.concatenate(rows)
+
+
+def _triangular_solve(
+    matrix: Float[Array, "n n"],
+    right: Array,
+    *,
+    left_side: bool,
+    lower: bool,
+    transpose_a: bool,
+    unit_diagonal: bool,
+) -> Array:
+    if not left_side:
+        matrix, lower, right = matrix.T, not lower, right.T
+    if transpose_a:
+        matrix, lower = matrix.T, not lower
+    if lower:
+        out = _substituted(matrix, right, unit_diagonal)
+    else:
+        out = _substituted(matrix[::-1, ::-1], right[::-1], unit_diagonal)[::-1]
+    return out if left_side else out.T
+
+
+def _lu(
+    matrix: Float[Array, "m n"],
+) -> tuple[Float[Array, "m n"], Int[Array, " k"], Int[Array, " m"]]:
+    """The factors, the pivot of each column, and the order of the rows."""
+    num_rows, num_columns = matrix.shape
+    numbers = jnp.arange(num_rows, dtype=jnp.int32)
+    pivots, order = [], numbers
+    for k in range(min(num_rows, num_columns)):
+        sizes = jnp.abs(matrix[k:, k])
+        # The first of the largest. Where an entry is NaN, all of them become NaN.
+        least = jnp.min(jnp.where(sizes == jnp.max(sizes), numbers[k:], num_rows - 1))
+        pivots.append(least)
+        exchanged = jnp.where(numbers == least, k, numbers)
+        exchanged = jnp.where(numbers == k, least, exchanged)
+        matrix, order = (
+            x.at[exchanged].get(mode="promise_in_bounds") for x in (matrix, order)
+        )
+        # A column of zeros is left as it is, as by LAPACK.
+        pivot = matrix[k, k]
+        factors = matrix[k + 1 :, k] / jnp.where(pivot == 0, 1, pivot)
+        rest = matrix[k + 1 :, k + 1 :] - factors[:, None] * matrix[None, k, k + 1 :]
+        below = jnp.concatenate([matrix[k + 1 :, :k], factors[:, None], rest], axis=1)
+        matrix = jnp.concatenate([matrix[: k + 1], below])
+    return matrix, jnp.stack(pivots), order
+
+
+def _order_after(pivots: Int[Array, " w"], *, permutation_size: int) -> Int[Array, " m"]:
+    rows = jnp.arange(permutation_size, dtype=pivots.dtype)
+    numbers = rows
+    for k in range(pivots.shape[0]):
+        exchanged = jnp.where(numbers == pivots[k], k, numbers)
+        exchanged = jnp.where(numbers == k, pivots[k], exchanged)
+        rows = rows.at[exchanged].get(mode="promise_in_bounds")
+    return rows
+
+
+def _sorted(operands: list[Array]) -> list[Array]:
+    """The operands in the order of the first, by the rank of each entry."""
+    (keys, *_), count = operands, operands[0].shape[0]
+    before = _is_before(keys[:, None], keys[None])
+    numbers = jnp.arange(count)
+    # Equal entries keep their order.
+    first = before | (~before.T & (numbers[:, None] < numbers[None]))
+    ranks = jnp.sum(first.astype(numbers.dtype), axis=0)
+    source = jnp.sum(jnp.where(ranks[None] == numbers[:, None], numbers[None], 0), axis=1)
+    return [x.at[source].get(mode="promise_in_bounds") for x in operands]
+
+
+def _is_before(a: Array, b: Array) -> Bool[Array, "..."]:
+    """Whether `a` comes before `b`; NaN comes last."""
+    if not jnp.issubdtype(a.dtype, jnp.inexact):
+        return a < b
+    return (a < b) | (jnp.isnan(b) & ~jnp.isnan(a))
+
+
+def _of_each(fn: Callable, num_axes: int, *values: Array) -> Any:
+    """`fn` of the last axes of arrays, for all entries of the others."""
+    batch = values[0].shape[: values[0].ndim - num_axes]
+    for _ in batch:
+        fn = jax.vmap(fn)
+    return fn(*values)
+
+
+_TRIANGULAR = "left_side lower transpose_a unit_diagonal".split()
+
+
+def in_plain_operations(
+    name: str, values: list[Array], params: dict[str, Any]
+) -> list[Array]:
+    """The outputs of one of `PLAIN`."""
+    if name == "sort":
+        axis = params["dimension"]
+        moved = [jnp.moveaxis(x, axis, -1) for x in values]
+        out = _of_each(lambda *xs: _sorted(list(xs)), 1, *moved)
+        return [jnp.moveaxis(x, -1, axis) for x in out]
+    if name == "cholesky":
+        return [_of_each(_cholesky, 2, *values)]
+    if name == "triangular_solve":
+        how = {key: params[key] for key in _TRIANGULAR}
+        return [_of_each(functools.partial(_triangular_solve, **how), 2, *values)]
+    if name == "lu":
+        return list(_of_each(_lu, 2, *values))
+    size = params["permutation_size"]
+    return [_of_each(functools.partial(_order_after, permutation_size=size), 1, *values)]
+
+
+# The primitives that have such a form.
+PLAIN = frozenset("cholesky lu lu_pivots_to_permutation sort triangular_solve".split())
+
+
+def is_small(eqn: Any) -> bool:
+    """Whether the plain form of one of these primitives is the faster one."""
+    name, params, x = eqn.primitive.name, eqn.params, eqn.invars[0].aval
+    if name == "sort":
+        return params["num_keys"] == 1 and 0 < x.shape[params["dimension"]] <= _MOST_SORTED
+    if name == "lu_pivots_to_permutation":
+        return 0 < x.shape[-1] and params["permutation_size"] <= _MOST_ROWS
+    is_real = jnp.issubdtype(x.dtype, jnp.floating)
+    return is_real and 0 < min(x.shape) and max(x.shape[-2:]) <= _MOST_ROWS
