@@ -85,7 +85,6 @@ RULES: dict[str, Rule] = {
     "custom_linear_solve": linalg.linear_solve,
     "lu": linalg.lu,
     "jit enerjax_inverse": linalg.inverse,
-    "jit enerjax_inverse_of_definite": linalg.inverse,
     "scan": loops.scan,
     "cond": loops.cond,
 }

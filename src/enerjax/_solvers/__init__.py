@@ -17,7 +17,6 @@ from .linear.cholesky_eigh import cholesky as cholesky, eigh as eigh
 from .linear.dense import (
     AbstractFactors as AbstractFactors,
     inverse as inverse,
-    inverse_of_definite as inverse_of_definite,
     product as product,
     SMALL as SMALL,
     solve as solve,

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._solvers import inverse, inverse_of_definite, solve_definite
+from .._solvers import inverse, solve_definite
 from .._types import Args, Coordinates, Scalar, Velocities
 from .base import (
     AbstractSystem,
@@ -95,7 +95,7 @@ class LagrangianSystem(AbstractCanonicalSystem):
         return _legendre_transform(energies, rate, q, p, args), rate
 
     def inverse_inertia(self, q, p, args):
-        return inverse_of_definite(self.inertia(State(q, p), args))
+        return inverse(self.inertia(State(q, p), args))
 
     def masses(self, q, p, args):
         return jnp.diagonal(self.inertia(State(q, p), args))

@@ -1,7 +1,7 @@
 """Sorting, and factors of small matrices, in operations that are possible in one function.
 
-XLA calls a library for them. Here they cost more operations, which are fewer than such a
-call costs, and the calls would also divide the program around them.
+XLA calls a library for each of them. For a few rows the call takes longer than the plain
+operations, and it keeps the program around it from being one function.
 """
 
 import functools

@@ -332,5 +332,4 @@ _RULES: dict[str, Callable] = {
     "scatter-add": _added,
     CONTRACTION: _product,
     "jit enerjax_inverse": _each_matrix,
-    "jit enerjax_inverse_of_definite": _each_matrix,
 }

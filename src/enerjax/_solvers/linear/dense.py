@@ -11,7 +11,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..._programs import in_one_function, LARGEST_SUM, unmerged
@@ -23,8 +22,8 @@ from .norms import largest
 SMALL = 32
 # Rows up to which the loop over columns is unrolled. Longer unrolled loops compile slowly.
 _UNROLLED = 3
-# The same without pivoting, which takes fewer operations.
-_UNROLLED_WITHOUT_PIVOTS = 16
+# The same for `solve_definite`, which does not look for pivots.
+_UNROLLED_IF_DEFINITE = 16
 
 
 def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -91,46 +90,6 @@ def _sums(a: Float[Array, "n n"], b: Float[Array, "n n"]) -> Float[Array, "n n"]
     if a.shape[0] ** 3 > LARGEST_SUM:
         return product(a, b)
     return jnp.sum(a[:, :, None] * b[None], axis=1)
-
-
-def inverse_of_definite(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The inverse of a symmetric positive definite matrix, in half the operations."""
-    return enerjax_inverse_of_definite(matrix)
-
-
-@jax.jit
-def enerjax_inverse_of_definite(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Found by its name, as `enerjax_inverse` is."""
-    return _inverse_of_definite(matrix)
-
-
-@jax.custom_jvp
-def _inverse_of_definite(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    return jnp.linalg.inv(matrix) if matrix.shape[0] > SMALL else eliminated(matrix)
-
-
-@_inverse_of_definite.defjvp
-def _inverse_of_definite_jvp(primals, tangents):
-    (x,), (dx,) = primals, tangents
-    y = inverse_of_definite(x)
-    return y, -_sums(_sums(y, dx), y)
-
-
-def eliminated(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The inverse of a positive definite matrix, by in-place elimination; no pivoting."""
-    order = np.arange(matrix.shape[0])
-
-    def column(k: Any, matrix: Array) -> Array:
-        pivot = 1 / matrix[k, k]
-        own = order == k
-        row = jnp.where(own, pivot, matrix[k] * pivot)
-        factors = jnp.where(own, -1, matrix[:, k])
-        left = jnp.where(own[None] | own[:, None], 0, matrix)
-        return left - factors[:, None] * row[None]
-
-    if order.size > _UNROLLED_WITHOUT_PIVOTS:
-        return jax.lax.fori_loop(0, order.size, column, matrix)
-    return functools.reduce(lambda matrix, k: column(k, matrix), order, matrix)
 
 
 class AbstractFactors(eqx.Module):
@@ -255,7 +214,7 @@ def solve_definite(
     matrix: Float[Array, "n n"], right: Float[Array, " n"]
 ) -> Float[Array, " n"]:
     """`matrix^-1 right` for a symmetric positive definite matrix, in few operations."""
-    if matrix.shape[0] > _UNROLLED_WITHOUT_PIVOTS:
+    if matrix.shape[0] > _UNROLLED_IF_DEFINITE:
         return solve(matrix, right)
     return _solve_definite(matrix, right)
 

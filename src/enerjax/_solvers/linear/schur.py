@@ -11,6 +11,7 @@ elimination needs no pivoting.
 import functools
 from collections.abc import Callable
 from itertools import pairwise
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,13 +23,14 @@ from jaxtyping import Array, Float
 from ..._programs import Indices, jacobian_pattern, shape_of, summed, unmerged
 from .block_diagonal import BlockDiagonal, Symmetric
 from .block_tridiagonal import block_sizes, coloured_products, column_colours
-from .dense import eliminated
 
 
 # The number of unknowns up to which `B` is treated as dense.
 _FEW = 8
 # The largest number of rows of a block. Larger blocks would be eliminated too slowly.
 _WIDEST = 32
+# The number of rows up to which the loop that inverts a block is unrolled.
+_UNROLLED = 16
 
 
 class SchurTables(Indices):
@@ -226,15 +228,15 @@ def schur(
     diagonal, below = _blocks(tables, rows, weighted)
     if tables.num_blocks == 1:
         none = jnp.zeros((0, tables.width, tables.width), at.dtype)
-        return Schur(tables, rows, none, eliminated(diagonal[0])[None])
+        return Schur(tables, rows, none, _inverse(diagonal[0])[None])
 
     def eliminate(before, item):
         own, below = item
         factor = _times(below, before)
-        found = eliminated(own - _times(factor, below.T))
+        found = _inverse(own - _times(factor, below.T))
         return found, (factor, found)
 
-    first = eliminated(diagonal[0])
+    first = _inverse(diagonal[0])
     _, (factors, inverses) = jax.lax.scan(eliminate, first, (diagonal[1:], below))
     return Schur(tables, rows, factors, jnp.concatenate([first[None], inverses]))
 
@@ -264,6 +266,23 @@ def _blocks(tables: SchurTables, rows: Array, weighted: Array) -> tuple[Array, A
 
     padding = jnp.asarray(tables.padding, rows.dtype)
     return blocks(tables.diagonal) + padding, blocks(tables.below)
+
+
+def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """The inverse of a positive definite matrix, by in-place elimination; no pivoting."""
+    order = np.arange(matrix.shape[0])
+
+    def column(k: Any, matrix: Array) -> Array:
+        pivot = 1 / matrix[k, k]
+        own = order == k
+        row = jnp.where(own, pivot, matrix[k] * pivot)
+        factors = jnp.where(own, -1, matrix[:, k])
+        left = jnp.where(own[None] | own[:, None], 0, matrix)
+        return left - factors[:, None] * row[None]
+
+    if order.size > _UNROLLED:
+        return jax.lax.fori_loop(0, order.size, column, matrix)
+    return functools.reduce(lambda matrix, k: column(k, matrix), order, matrix)
 
 
 def _times(a: Float[Array, "m n"], b: Float[Array, "n k"]) -> Float[Array, "m k"]:
