@@ -125,6 +125,10 @@ IN_OTHER_WORDS = {
         for axis in (0, 1)
     ],
     "running back": lambda x: [jax.lax.cumsum(x, axis=1, reverse=True), jnp.cumsum(x[:0])],
+    "running far": lambda x: [
+        jnp.cumsum(jnp.tile(x, 5), 1),
+        jax.lax.cummax(jnp.asarray(TWICE)),
+    ],
     "sorted": sorting,
     "factors": factors,
     "solutions": solutions,

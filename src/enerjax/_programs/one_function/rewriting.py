@@ -81,7 +81,7 @@ def _equation(eqn: Any, values: list[Any]) -> list[Any]:
         if name in _OF_PAIRS:
             return [_reduced(eqn.primitive, jnp.asarray(values[0]), params)]
         if name in CUMULATIVE:
-            return [_running(_OF_TWO[name], jnp.asarray(values[0]), **params)]
+            return [_running(name, jnp.asarray(values[0]), **params)]
         if name in PLAIN:
             return in_plain_operations(name, list(map(jnp.asarray, values)), params)
     elif any(map(_needs_rewriting, programs_within(eqn))):
@@ -245,22 +245,35 @@ def _reduced(primitive: Any, x: Array, params: dict[str, Any]) -> Array:
 
 # Running sums -----------------------------------------------------------------------------
 
-_OF_TWO: dict[str, Callable[[Any, Any], Any]] = {
-    "cumsum": lax.add,
-    "cumprod": lax.mul,
-    "cummax": lax.max,
-    "cummin": lax.min,
+# The operation on two entries, the one on many, and the number that changes nothing.
+_OF_RUNNING: dict[str, tuple[Callable[..., Array], Callable[..., Array], float]] = {
+    "cumsum": (lax.add, jnp.sum, 0),
+    "cumprod": (lax.mul, jnp.prod, 1),
+    "cummax": (lax.max, jnp.max, -np.inf),
+    "cummin": (lax.min, jnp.min, np.inf),
 }
+# The number of entries up to which all of them are joined at once.
+_FEW_RUNNING = 16
 
 
-def _running(op: Callable[[Any, Any], Any], x: Array, *, axis: int, reverse: bool) -> Array:
-    """Each entry joined with all before it, by shifts that double (W. D. Hillis and G. L.
-    Steele, 1986)."""
+def _running(name: str, x: Array, *, axis: int, reverse: bool) -> Array:
+    """Each entry joined with all before it along an axis."""
+    of_two, of_many, neutral = _OF_RUNNING[name]
+    count = x.shape[axis]
+    is_float = jnp.issubdtype(x.dtype, jnp.floating)
+    if count <= _FEW_RUNNING and (is_float or np.isfinite(neutral)):
+        before = np.tril(np.ones((count, count), bool))
+        before = (before.T if reverse else before).reshape(
+            *[1] * axis, count, count, *[1] * (x.ndim - axis - 1)
+        )
+        terms = jnp.where(before, jnp.expand_dims(x, axis), jnp.asarray(neutral, x.dtype))
+        return of_many(terms, axis=axis + 1).astype(x.dtype)
+    # By shifts that double (W. D. Hillis and G. L. Steele, 1986).
     x = jnp.moveaxis(x, axis, 0)
     x = x[::-1] if reverse else x
     shift = 1
-    while shift < len(x):
-        x = jnp.concatenate([x[:shift], op(x[:-shift], x[shift:])])
+    while shift < count:
+        x = jnp.concatenate([x[:shift], of_two(x[:-shift], x[shift:])])
         shift *= 2
     return jnp.moveaxis(x[::-1] if reverse else x, 0, axis)
 
