@@ -96,10 +96,18 @@ FAULTS = (
     Fault(
         "run: damping does not count as stiff",
         "_operators/separable.py",
-        "(state.q, state.v), (moved, change))[1]",
-        "(state.q, state.v), (moved, 0 * change))[1]",
+        "(state.q, state.v), (moved, v))[1]",
+        "(state.q, state.v), (moved, 0 * v))[1]",
         "The estimate of the contraction of the chord method leaves out dampers.",
         of("chord::test_stiff_forces_are_noticed_before_the_first_program"),
+    ),
+    Fault(
+        "run: running sums begin at the wrong end",
+        "_programs/one_function/rewriting.py",
+        "(before.T if reverse else before)",
+        "(before if reverse else before.T)",
+        "A program in one function adds up what comes after an entry.",
+        of("rewriting::test_rewritten_programs_have_the_same_values_and_derivatives"),
     ),
     Fault(
         "root: derivative at the guess",

@@ -4,6 +4,23 @@ from seeded_fault import Fault, of
 
 
 FAULTS = (
+    # Varying inertia --------------------------------------------------------------------
+    Fault(
+        "product rule: the inertia of one end",
+        "_operators/canonical.py",
+        "inner = solve_definite(0.5 * (inertias[0] + inertias[1]),",
+        "inner = solve_definite(inertias[0],",
+        "The discrete gradient of the kinetic energy is not directional.",
+        of("general_energies"),
+    ),
+    Fault(
+        "consistent: forces count as work",
+        "schemes/energy_consistent.py",
+        "            rate=gradient.rate + rate,\n            rows=gradient.rows,\n",
+        "            rate=gradient.rate + rate,\n            work=gradient.rows,\n",
+        "With `alpha > 0` the forces do not enter the balance of momentum.",
+        of("forces::test_a_damped_oscillator_follows_its_closed_form"),
+    ),
     # Discrete derivatives ---------------------------------------------------------------
     Fault(
         "chain rule: one-sided product",

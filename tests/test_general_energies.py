@@ -120,6 +120,36 @@ def test_lanes_of_a_sweep_are_their_single_runs():
     np.testing.assert_allclose(lanes, alone, rtol=1e-11)
 
 
+def test_derivatives_of_a_hamiltonian_by_numbers_of_python():
+    system = ej.System.from_lagrangian(
+        lambda q, v, args: 0.5 * args["m"] * (2 + jnp.cos(q[0] - q[1])) * v @ v,
+        lambda q, args: args["m"] * 9.81 * jnp.sum(q),
+    )
+
+    def energy(z, m):
+        return system.hamiltonian_and_rate(z[:2], z[2:], {"m": m, "name": "a"})[0]
+
+    def exact(z, m):
+        inertia = m * (2 + jnp.cos(z[0] - z[1]))
+        return 0.5 * z[2:] @ z[2:] / inertia + m * 9.81 * (z[0] + z[1])
+
+    z = jnp.array([0.3, -0.8, 1.1, 0.4])
+    for of in (jax.grad, jax.hessian):
+        found, expected = (of(fn, (0, 1))(z, 1.5) for fn in (energy, exact))
+        close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-13)
+        jax.tree.map(close, found, expected)  # round-off
+
+
+def test_a_linear_term_that_vanishes_at_the_start_is_refused():
+    system = ej.System.from_lagrangian(
+        lambda q, v, args: 0.5 * v @ v + jnp.sin(q[0]) * q[1] * v[1],
+        lambda q, args: 0.5 * q @ q,
+    )
+    start = ej.State([0.0, 0.5], [0.1, 0.2])
+    with pytest.raises(ValueError, match="not quadratic in the velocities"):
+        ej.simulate(system, ej.EnergyPreserving(), start, h=0.01, num_steps=3)
+
+
 def _charged(q, p, args):
     """A particle in a uniform magnetic field across the plane."""
     momentum = p - 0.5 * args["b"] * jnp.array([-q[1], q[0]])

@@ -76,12 +76,12 @@ class AbstractModel(eqx.Module):
     # The index tables of `delassus_matrix`; `None` where there is none, or no joints.
     constraint_tables: eqx.AbstractVar[SchurTables | None]
 
+    @abc.abstractmethod
     def with_known_zeros(self, state: State) -> "AbstractModel":
         """The model, with known numbers in place of what is zero in every inertia.
 
         `state` is any state of the model.
         """
-        return self
 
     @property
     @abc.abstractmethod
@@ -275,6 +275,11 @@ class AbstractModel(eqx.Module):
     @abc.abstractmethod
     def delassus_matrix(self, state: State) -> DelassusMatrix:
         """`B M^-1 B^T` at a state. It exists only if `has_delassus_matrix`."""
+
+    @abc.abstractmethod
+    def neglected_by_chord(self, state: State, v: Velocities, h: Scalar) -> Velocities:
+        """The velocities that stiffness, damping and the change of the inertia cause in a
+        step with the velocities `v`: the chord method neglects them."""
 
     @abc.abstractmethod
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:

@@ -41,11 +41,12 @@ class CanonicalModel(AbstractModel):
         self.args = args
         state = self.to_internal(state)
         self.scales = self._scales(state)
-        rest = jnp.zeros_like(state.q)
-        tables = lambda: schur_tables(
-            self._rates_of_joints(state), rest, self.metric(state)
-        )
-        self.constraint_tables = None if system.redundant else tables()
+        # Redundant constraints make the matrix singular.
+        self.constraint_tables = None if system.redundant else self._tables(state)
+
+    def with_known_zeros(self, state: State) -> "CanonicalModel":
+        # The inertia is a function of the coordinates, evaluated where it is needed.
+        return self
 
     @property
     def has_own_momenta(self) -> bool:
@@ -289,6 +290,14 @@ class CanonicalModel(AbstractModel):
         _, (force, rate, _) = jax.jvp(gradient, at, change)
         _, (force, rate, power) = jax.jvp(gradient, at, (rate / h, -force / h, no_time))
         return Gradient(force, rate / h, power)
+
+    def neglected_by_chord(self, state: State, v: Velocities, h: Scalar) -> Velocities:
+        moved, force = 0.5 * h * v, self.metric(state) @ v
+        rows = lambda q, p: (self.slope(State(q, p, state.t)), self.lift(q, p))
+        slope, rate = jax.jvp(rows, (state.q, state.v), (moved, force))[1]
+        inverse = self.system.inverse_inertia(state.q, state.v, self.args)
+        # The chord method has the part `M^-1 p` of the rate.
+        return 0.5 * h * (inverse @ slope) - (rate - v)
 
     @property
     def has_delassus_matrix(self) -> bool:

@@ -217,21 +217,15 @@ class SeparableModel(AbstractModel):
             return slope
         return slope - self.pull(q, q, self.force(q, state.v, state.t))
 
-    def acceleration_change(
-        self, state: State, moved: Coordinates, change: Velocities
-    ) -> Velocities:
-        """The change of `M^-1 (grad V - f)` with the position and the velocity.
-
-        `moved` is the change of the coordinates, and `change` that of the velocity.
-        """
-
+    def neglected_by_chord(self, state: State, v: Velocities, h: Scalar) -> Velocities:
         def acceleration(q: Coordinates, v: Velocities) -> Velocities:
             rows = self.slope(State(q, v, state.t))
             is_rotated = self.without_rotations is not None
             force = rows if is_rotated else self._lowered(q, rows)
             return self.inverse_inertia @ force
 
-        return jax.jvp(acceleration, (state.q, state.v), (moved, change))[1]
+        moved = 0.5 * h * self.lift(state.q, v)
+        return 0.5 * h * jax.jvp(acceleration, (state.q, state.v), (moved, v))[1]
 
     def velocity(self, state: State) -> Velocities:
         return state.v

@@ -64,7 +64,10 @@ def chord_alone(task: Task, values: Task) -> Task | None:
         return None
     is_separable = isinstance(system, System)
     has_joints = system.constraint is not None or system.driven is not None
-    if is_separable and not has_joints:
+    if not has_joints and (is_separable or 2 * values.start.q.size <= MOST_BY_NEWTON):
+        return None
+    # The inertia of an arm is ill-conditioned: single precision leaves too few digits.
+    if not is_separable and values.start.q.dtype == jnp.float32:
         return None
     experience = _experience(values)
     if experience.needs_newton:
@@ -74,7 +77,7 @@ def chord_alone(task: Task, values: Task) -> Task | None:
             return None
         experience.is_linear = is_separable and _is_linear(system, values)
     # NaN compares false: such a run fails in any program.
-    if is_separable and not experience.is_linear:
+    if not experience.is_linear:
         contraction = values_of(_contraction(values))
         if bool(contraction > _CONTRACTS):
             return None
@@ -132,20 +135,20 @@ def _is_linear(system: System, task: Task) -> bool:
 def _contraction(task: Task) -> Scalar:
     """An estimate, at the start, of the contraction of the chord method by stiff forces.
 
-    It is the spectral radius of `h^2/4 M^-1 K + h/2 M^-1 D` with the stiffness and damping
-    of the forces, by power iteration.
+    With constant inertia it is the spectral radius of `h^2/4 M^-1 K + h/2 M^-1 D`, with the
+    stiffness and damping of the forces, by power iteration.
     """
     model = model_for(task.scheme, task.system, task.start, task.args)
-    assert isinstance(model, SeparableModel)
     start, h = model.to_internal(task.start), task.plan.unit
-    size = lambda v: jnp.sqrt(v @ model.inertia @ v)
+    is_separable = isinstance(model, SeparableModel)
+    inertia = model.inertia if is_separable else model.metric(start)
+    size = lambda v: jnp.sqrt(v @ inertia @ v)
 
     def after(v: jax.Array, _: None) -> tuple[jax.Array, Scalar]:
-        moved = 0.5 * h * model.lift(start.q, v)
-        change = 0.5 * h * model.acceleration_change(start, moved, v)
+        change = model.neglected_by_chord(start, v, h)
         return change / jnp.maximum(size(change), jnp.finfo(h.dtype).tiny), size(change)
 
     v = jnp.cos(jnp.arange(1.0, start.v.size + 1)).astype(h.dtype)
-    v = v / jnp.sqrt(model.inertia.diagonal())
+    v = v / jnp.sqrt(inertia.diagonal())
     _, sizes = jax.lax.scan(after, v / size(v), None, length=_PASSES)
     return sizes[-1]

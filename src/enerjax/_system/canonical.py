@@ -6,6 +6,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._solvers import inverse, solve_definite
@@ -90,6 +91,7 @@ class LagrangianSystem(AbstractCanonicalSystem):
             self.kinetic(q, rate, args),
             self.potential(q, args),
         )
+        args = _with_arrays(args)
         # The functions of the user may close over traced numbers.
         energies = eqx.filter_closure_convert(energies, q, rate, args)
         return _legendre_transform(energies, rate, q, p, args), rate
@@ -107,6 +109,16 @@ class LagrangianSystem(AbstractCanonicalSystem):
         return solve_definite(self.inertia(State(q, p), args), p)
 
 
+def _with_arrays(args: Args) -> Args:
+    """`args` with arrays of JAX in place of other numbers.
+
+    A function that `filter_closure_convert` has returned takes the kinds of arguments that
+    it was converted with, and under `jax.grad` a Python number becomes traced.
+    """
+    convert = lambda x: jnp.asarray(x) if isinstance(x, float | np.ndarray) else x
+    return jax.tree.map(convert, args)
+
+
 @eqx.filter_custom_jvp
 def _legendre_transform(
     energies: Callable[[Coordinates, Velocities, Args], tuple[Scalar, Scalar]],
@@ -116,7 +128,7 @@ def _legendre_transform(
     args: Args,
 ) -> Scalar:
     """`H(q, p) = p . qdot - T(q, qdot) + V(q)` at the rate `qdot` that belongs to `p`."""
-    _, potential = energies(q, rate, args)
+    _, potential = energies(q, rate, _with_arrays(args))
     return 0.5 * p @ rate + potential
 
 
@@ -125,6 +137,7 @@ def _legendre_transform_jvp(primals, tangents):
     # `p . qdot - T` is stationary in the rate, so neither the inertia nor its inverse is
     # differentiated.
     energies, rate, q, p, args = primals
+    args = _with_arrays(args)
     t_energies, _, t_q, t_p, t_args = tangents
     values, rates = eqx.filter_jvp(
         lambda energies, q, args: energies(q, rate, args),

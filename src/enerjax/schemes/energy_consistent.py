@@ -229,7 +229,11 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
         force = h**2 / 12 * self._alpha(h) * (dissipative.matrix @ jump_v)
         undamped = dissipative.inverse_inertia @ (dissipative.matrix @ (h**2 / 6 * z.rate))
         rate = step.model.momentum_rows(0.5 * (jump_v - undamped))
-        total = Gradient(gradient.impulse + force, gradient.rate + rate, gradient.rows)
+        total = Gradient(
+            impulse=gradient.impulse + force,
+            rate=gradient.rate + rate,
+            rows=gradient.rows,
+        )
         return step.rows(z, end, total)
 
     def _end_and_jump(

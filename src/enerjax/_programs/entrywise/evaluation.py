@@ -12,9 +12,9 @@ from jax.core import Tracer
 
 from ..jaxprs import has_numbers, interpret, solution_program, wrapped_program
 from ..numpy_primitives import as_rows, evaluated, is_inside, moved
-from ..one_function.possible import NAME
+from ..one_function.possible import FACTORS, NAME
 from ..one_function.rewriting import places_of_updates
-from ..one_function.small_matrices import in_plain_operations, is_small, PLAIN
+from ..one_function.small_matrices import in_plain_operations, is_small
 from ..primitives import (
     COMPONENTS,
     CONTRACTION,
@@ -115,7 +115,7 @@ class Evaluation:
             return [self._elementwise(primitive, values, params, avals[0])]
         if name in _OF_PAIRS:
             return [self._reduced(_OF_PAIRS[name], values[0], params["axes"], avals[0])]
-        if name in PLAIN and is_small(eqn):
+        if name in FACTORS and is_small(eqn):
             plain = lambda *values: in_plain_operations(name, list(values), params)
             like = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in eqn.invars]
             return self.closed(jax.make_jaxpr(plain)(*like), values)

@@ -30,9 +30,9 @@ from ..jaxprs import (
 )
 from ..numpy_primitives import evaluated
 from ..primitives import CONTRACTION, CUMULATIVE, LINEAR_SOLVE, SCATTERS
-from .possible import is_part, is_small_product, LARGEST_SUM, NAME
+from .possible import FACTORS, is_part, is_small_product, LARGEST_SUM, NAME
 from .products import written_out
-from .small_matrices import in_plain_operations, is_small, PLAIN
+from .small_matrices import in_plain_operations, is_small
 
 
 def rewritten(jaxpr: Any, known: Sequence[np.ndarray | None]) -> ClosedJaxpr:
@@ -82,7 +82,7 @@ def _equation(eqn: Any, values: list[Any]) -> list[Any]:
             return [_reduced(eqn.primitive, jnp.asarray(values[0]), params)]
         if name in CUMULATIVE:
             return [_running(name, jnp.asarray(values[0]), **params)]
-        if name in PLAIN:
+        if name in FACTORS:
             return in_plain_operations(name, list(map(jnp.asarray, values)), params)
     elif any(map(_needs_rewriting, programs_within(eqn))):
         if name in _LOOPS:
@@ -107,7 +107,7 @@ def _must_be_replaced(eqn: Any) -> bool:
         return eqn.invars[0].aval.size > LARGEST_SUM
     if is_part(eqn):
         return True
-    if name in PLAIN:
+    if name in FACTORS:
         return is_small(eqn)
     return name in (*SCATTERS, *CUMULATIVE, LINEAR_SOLVE) or (
         name == CONTRACTION and not is_small_product(eqn)
@@ -252,8 +252,6 @@ _OF_RUNNING: dict[str, tuple[Callable[..., Array], Callable[..., Array], float]]
     "cummax": (lax.max, jnp.max, -np.inf),
     "cummin": (lax.min, jnp.min, np.inf),
 }
-# The number of entries up to which all of them are joined at once.
-_FEW_RUNNING = 16
 
 
 def _running(name: str, x: Array, *, axis: int, reverse: bool) -> Array:
@@ -261,7 +259,7 @@ def _running(name: str, x: Array, *, axis: int, reverse: bool) -> Array:
     of_two, of_many, neutral = _OF_RUNNING[name]
     count = x.shape[axis]
     is_float = jnp.issubdtype(x.dtype, jnp.floating)
-    if count <= _FEW_RUNNING and (is_float or np.isfinite(neutral)):
+    if x.size * count <= LARGEST_SUM and (is_float or np.isfinite(neutral)):
         before = np.tril(np.ones((count, count), bool))
         before = (before.T if reverse else before).reshape(
             *[1] * axis, count, count, *[1] * (x.ndim - axis - 1)
@@ -279,7 +277,7 @@ def _running(name: str, x: Array, *, axis: int, reverse: bool) -> Array:
 
 
 # Primitives that this module replaces, where their indices are known and sizes allow it.
-REWRITTEN = SCATTERS | CUMULATIVE | PLAIN | _OF_PAIRS.keys() | {CONTRACTION, LINEAR_SOLVE}
+REWRITTEN = SCATTERS | CUMULATIVE | FACTORS | _OF_PAIRS.keys() | {CONTRACTION, LINEAR_SOLVE}
 
 
 def _picked(flat: Array, source: Array | np.ndarray, shape: tuple[int, ...]) -> Array:

@@ -24,7 +24,9 @@ def _cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
         column = matrix[:, 0] / jnp.sqrt(matrix[0, 0])
         columns.append(jnp.pad(column, (k, 0)))
         matrix = matrix[1:, 1:] - column[1:, None] * column[None, 1:]
-    return jnp.stack(columns, axis=1)
+    factor = jnp.stack(columns, axis=1)
+    # As by LAPACK, nothing is left of the factor of a matrix that is not definite.
+    return jnp.where(jnp.isfinite(factor[-1, -1]), factor, jnp.nan)
 
 
 def _substituted(
@@ -68,7 +70,7 @@ def _lu(
     pivots, order = [], numbers
     for k in range(min(num_rows, num_columns)):
         sizes = jnp.abs(matrix[k:, k])
-        # The first of the largest. Where an entry is NaN, all of them become NaN.
+        # The first of the largest; the last row where there is none, because of a NaN.
         least = jnp.min(jnp.where(sizes == jnp.max(sizes), numbers[k:], num_rows - 1))
         pivots.append(least)
         exchanged = jnp.where(numbers == least, k, numbers)
@@ -128,7 +130,7 @@ _TRIANGULAR = "left_side lower transpose_a unit_diagonal".split()
 def in_plain_operations(
     name: str, values: list[Array], params: dict[str, Any]
 ) -> list[Array]:
-    """The outputs of one of `PLAIN`."""
+    """The outputs of one of `FACTORS`."""
     if name == "sort":
         axis = params["dimension"]
         moved = [jnp.moveaxis(x, axis, -1) for x in values]
@@ -143,10 +145,6 @@ def in_plain_operations(
         return list(_of_each(_lu, 2, *values))
     size = params["permutation_size"]
     return [_of_each(functools.partial(_order_after, permutation_size=size), 1, *values)]
-
-
-# The primitives that have such a form.
-PLAIN = frozenset("cholesky lu lu_pivots_to_permutation sort triangular_solve".split())
 
 
 def is_small(eqn: Any) -> bool:
