@@ -15,6 +15,7 @@ import json  # noqa: E402
 import resource  # noqa: E402
 import sys  # noqa: E402
 from collections.abc import Callable  # noqa: E402
+from pathlib import Path  # noqa: E402
 from typing import Any  # noqa: E402
 
 import harness  # noqa: E402
@@ -28,6 +29,7 @@ import enerjax as ej  # noqa: E402
 
 # The least processor time of a measurement. Shorter runs are repeated.
 _LEAST_SECONDS = 0.05
+_PROJECT = Path(__file__).parents[1]
 # How much finer the steps of a reference are.
 _FINER = {"mujoco": 8, "exudyn": 10}
 # Lengths of the steps of difference quotients, relative to the numbers.
@@ -109,7 +111,8 @@ def _run(work: Work) -> tuple[Record, Timers]:
         operations=explained.operations,
         method=explained.method,
         matrices=explained.chord or explained.jacobian,
-        obstacles=list(explained.obstacles),
+        # Without the folder of this copy of the project.
+        obstacles=[x.replace(f"{_PROJECT}/", "") for x in explained.obstacles],
     )
     motions, timers = [], {}
     for number, motion in enumerate(work.motions):
