@@ -63,13 +63,10 @@ class CanonicalModel(AbstractModel):
         return State(state.q, self.system.velocity(state.q, state.v, self.args))
 
     def hamiltonian(self, q: Coordinates, p: Velocities) -> Scalar:
-        return self.system.hamiltonian_and_rate(q, p, self.args)[0]
-
-    def _total(self, state: State) -> Scalar:
-        return self.hamiltonian(state.q, state.v)
+        return self.system.hamiltonian_at(q, p, self.args)
 
     def kinetic(self, state: State) -> Scalar:
-        return self._total(state) - self.potential(state)
+        return self.hamiltonian(state.q, state.v) - self.potential(state)
 
     def kinetic_change(self, a: State, b: State, gradient: Gradient) -> Scalar:
         return gradient.rate @ (b.v - a.v)
@@ -88,7 +85,7 @@ class CanonicalModel(AbstractModel):
         return self.joint(q, t)
 
     def lift(self, q: Coordinates, v: Velocities) -> Coordinates:
-        return self.system.hamiltonian_and_rate(q, v, self.args)[1]
+        return self.system.rate(q, v, self.args)
 
     def momentum(self, state: State) -> Velocities:
         return state.v
@@ -175,8 +172,8 @@ class CanonicalModel(AbstractModel):
 
         def action(z: Float[Array, " nz"]) -> Scalar:
             q, p = z[:size], z[size:]
-            energy = self.potential if by_product_rule else self._total
-            out = h * energy(State(q, p))
+            potential = lambda: self.potential(State(q, p))
+            out = h * (potential() if by_product_rule else self.hamiltonian(q, p))
             if has_slip_rate:
                 slip_rate = self.nonholonomic(q) @ self.lift(q, p)
                 out = out + h * nonholonomic.velocity_impulse @ slip_rate

@@ -30,10 +30,12 @@ class AbstractCanonicalSystem(AbstractSystem):
     """A system with a Hamiltonian `H(q, p)`."""
 
     @abc.abstractmethod
-    def hamiltonian_and_rate(
-        self, q: Coordinates, p: Coordinates, args: Args
-    ) -> tuple[Scalar, Coordinates]:
-        """`H(q, p)` and `qdot = dH/dp`."""
+    def hamiltonian_at(self, q: Coordinates, p: Coordinates, args: Args) -> Scalar:
+        """`H(q, p)`"""
+
+    @abc.abstractmethod
+    def rate(self, q: Coordinates, p: Coordinates, args: Args) -> Coordinates:
+        """`qdot = dH/dp`"""
 
     @abc.abstractmethod
     def inverse_inertia(
@@ -85,7 +87,7 @@ class LagrangianSystem(AbstractCanonicalSystem):
         rest = jnp.zeros_like(state.q)
         return jax.hessian(lambda qdot: self.kinetic(state.q, qdot, args))(rest)
 
-    def hamiltonian_and_rate(self, q, p, args):
+    def hamiltonian_at(self, q, p, args):
         rate = self.velocity(q, p, args)
         energies = lambda q, rate, args: (
             self.kinetic(q, rate, args),
@@ -94,7 +96,10 @@ class LagrangianSystem(AbstractCanonicalSystem):
         args = _with_arrays(args)
         # The functions of the user may close over traced numbers.
         energies = eqx.filter_closure_convert(energies, q, rate, args)
-        return _legendre_transform(energies, rate, q, p, args), rate
+        return _legendre_transform(energies, rate, q, p, args)
+
+    def rate(self, q, p, args):
+        return self.velocity(q, p, args)
 
     def inverse_inertia(self, q, p, args):
         return inverse(self.inertia(State(q, p), args))
@@ -188,8 +193,11 @@ class HamiltonianSystem(AbstractCanonicalSystem):
     def masses(self, q, p, args):
         return 1 / jnp.diagonal(self.inverse_inertia(q, p, args))
 
-    def hamiltonian_and_rate(self, q, p, args):
-        return jax.value_and_grad(self.hamiltonian, argnums=1)(q, p, args)
+    def hamiltonian_at(self, q, p, args):
+        return self.hamiltonian(q, p, args)
+
+    def rate(self, q, p, args):
+        return jax.grad(self.hamiltonian, argnums=1)(q, p, args)
 
     def momentum(self, state: State, args: Args) -> Coordinates:
         return state.v

@@ -21,7 +21,6 @@ def step_chord(rows: Increment, delassus: DelassusMatrix) -> Increment:
 
     2 M rate + C^T (impulse - 2 eta) = r_m
     C rate = r_phi,   2 C rate - 2 G eta = r_psi
-
     """
     if rows.momentum.size > 0:
         found = step_chord(_without_momenta(rows, delassus), delassus)

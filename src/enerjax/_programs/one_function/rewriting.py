@@ -1,10 +1,10 @@
 """Programs rewritten with primitives that are possible in one function.
 
 Products of matrices become sums of products. Sums of many entries become loops over their
-terms, and running sums become a few sums of shifted arrays. Factors of small matrices are
-found by plain operations; see `small_matrices.py`. A scatter to places that are known while
-the program is traced, as in the derivative of `x[indices]`, becomes a gather: XLA can
-gather inside of one function, but not scatter.
+terms. Running sums become sums of chosen terms, or of shifted arrays if they are long.
+Factors of small matrices are found by plain operations; see `small_matrices.py`. A scatter
+to places that are known while the program is traced, as in the derivative of `x[indices]`,
+becomes a gather: XLA can gather inside of one function, but not scatter.
 """
 
 import functools

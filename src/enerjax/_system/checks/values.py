@@ -96,7 +96,8 @@ def _is_quadratic(
         return error <= bound
     # Another term can vanish at the start. Elsewhere the energy may not be defined.
     q = state.q
-    nearby = State(q + 1e-2 * (1 + jnp.max(jnp.abs(q))) * _probe(q), state.v)
+    moved = 1e-2 * (1 + jnp.max(jnp.abs(q))) * direction_without_symmetry(q)
+    nearby = State(q + moved, state.v)
     other, most = _quadratic_error(system, nearby, system.inertia(nearby, args), args)
     return (error <= bound) & ~((other > most) & jnp.isfinite(other))
 
@@ -107,17 +108,12 @@ def _quadratic_error(
     """The difference of a kinetic energy from `1/2 v . inertia v`, and its round-off."""
     v = state.v
     energy = lambda v: system.kinetic_energy(State(state.q, v), args)
-    # The probe is as large as the velocities.
-    probe = (1 + jnp.max(jnp.abs(v))) * _probe(v)
+    # The probe has no symmetry, and is as large as the velocities.
+    probe = (1 + jnp.max(jnp.abs(v))) * jnp.cos(jnp.arange(1, v.size + 1, dtype=v.dtype))
     quadratic = 0.5 * probe @ inertia @ probe
     error = jnp.abs(energy(probe) - quadratic) + jnp.abs(energy(-probe) - quadratic)
     size = jnp.abs(probe) @ jax.tree.map(jnp.abs, inertia) @ jnp.abs(probe)
     return error, 1e3 * jnp.finfo(v.dtype).eps * size
-
-
-def _probe(like: Array) -> Array:
-    """A vector of order one without symmetries."""
-    return jnp.cos(jnp.arange(1, like.size + 1, dtype=like.dtype))
 
 
 def _is_rigid(
