@@ -137,11 +137,13 @@ def solve(
     prepare = simplified(lambda: _prepared(scheme, problem, model, start, h, memory))
     prepared = apart(prepare)()
     unknown_scale, row_scale = prepared.unknown_scale, prepared.row_scale
+    # Multiplications take less time than divisions, and there is one for each residual.
+    reciprocals = prepared.reciprocals
 
     def scaled(x, inputs):
-        scheme, problem, unknown_scale, row_scale = inputs
-        z = jax.tree.map(jnp.multiply, x, unknown_scale)
-        return jax.tree.map(jnp.divide, scheme.residual(z, problem), row_scale)
+        scheme, problem, scales, (_, per_row) = inputs
+        z = jax.tree.map(jnp.multiply, x, scales[0])
+        return jax.tree.map(jnp.multiply, scheme.residual(z, problem), per_row)
 
     wait = memory.chord_wait
     alone = is_chord_alone(root_finder, scheme, model, memory)
@@ -149,7 +151,7 @@ def solve(
         scaled,
         root_finder,
         prepared.guess,
-        (scheme, problem, unknown_scale, row_scale),
+        (scheme, problem, (unknown_scale, row_scale), reciprocals),
         max_iterations=MAX_ITERATIONS,
         others=prepared.others,
         factors=None if alone else prepared.factors,
@@ -206,11 +208,15 @@ def unsolved(
 
 
 class _Prepared(eqx.Module):
-    """The data of a search: scales, guesses and factors. `flight` is a free flight."""
+    """The data of a search: scales, guesses and factors. `flight` is a free flight.
+
+    `reciprocals` are those of the scales of unknowns and rows.
+    """
 
     flight: PyTree[Any]
     unknown_scale: PyTree[Any]
     row_scale: PyTree[Any]
+    reciprocals: tuple[PyTree[Any], PyTree[Any]]
     least: Scalar
     guess: PyTree[Any]
     others: tuple[PyTree[Any], ...]
@@ -227,11 +233,14 @@ def _prepared(
 ) -> _Prepared:
     flight = free_flight(scheme, problem, model, start)
     unknown_scale, row_scale, least = scales_like(flight, model, start, h)
-    scaled = lambda z: jax.tree.map(jnp.divide, z, unknown_scale)
+    inverse = lambda scale: jax.tree.map(jnp.reciprocal, scale)
+    per_unknown = inverse(unknown_scale)
+    scaled = lambda z: jax.tree.map(jnp.multiply, z, per_unknown)
     return _Prepared(
         flight=flight,
         unknown_scale=unknown_scale,
         row_scale=row_scale,
+        reciprocals=(per_unknown, inverse(row_scale)),
         least=least,
         guess=scaled(jax.tree.map(jnp.add, flight, predicted(memory))),
         # The extrapolated guess can lie beyond a fold of the step equations. A free flight
@@ -282,15 +291,15 @@ def _chord(scheme: AbstractOneSolveScheme) -> Chord:
     assert isinstance(scheme, AbstractSchemeWithChord)
 
     def prepare(x, inputs):
-        scheme, problem, unknown_scale, _ = inputs
+        scheme, problem, (unknown_scale, _), _ = inputs
         z = jax.tree.map(jnp.multiply, x, unknown_scale)
         return scheme.delassus_matrix(z, problem)
 
     def correct(value, inputs, matrix):
-        scheme, problem, unknown_scale, row_scale = inputs
+        scheme, problem, (_, row_scale), (per_unknown, _) = inputs
         rows = jax.tree.map(jnp.multiply, value, row_scale)
         correction = scheme.chord(rows, problem, matrix)
-        return jax.tree.map(jnp.divide, correction, unknown_scale)
+        return jax.tree.map(jnp.multiply, correction, per_unknown)
 
     return Chord(prepare, correct)
 

@@ -29,6 +29,7 @@ from ..jaxprs import (
     wrapped_program,
 )
 from ..numpy_primitives import evaluated
+from ..places import at_places
 from ..primitives import CONTRACTION, CUMULATIVE, LINEAR_SOLVE, SCATTERS
 from .possible import FACTORS, is_part, is_small_product, LARGEST_SUM, NAME
 from .products import written_out
@@ -179,7 +180,7 @@ def _scattered(name: str, values: list[Any], params: dict[str, Any]) -> Array:
     if name == "scatter":
         source, falls = np.arange(size), places >= 0
         source[places[falls]] = size + np.flatnonzero(falls)
-        return _picked(jnp.append(jnp.ravel(operand), updates), source, operand.shape)
+        return at_places(jnp.append(jnp.ravel(operand), updates), source.reshape(operand.shape))
     order = np.argsort(places, kind="stable")
     order = order[places[order] >= 0]
     to = places[order]
@@ -195,15 +196,15 @@ def _scattered(name: str, values: list[Any], params: dict[str, Any]) -> Array:
         source = np.full((1 + before.max(), often.size), updates.size - 1)
         place = np.searchsorted(often, to[is_often])
         source[before[is_often], place] = order[is_often]
-        sums = _reduced(reduce_sum_p, updates[source], dict(axes=(0,)))
+        sums = _reduced(reduce_sum_p, at_places(updates, source), dict(axes=(0,)))
         source = np.full(size, often.size)
         source[often] = np.arange(often.size)
         sums = jnp.append(sums, jnp.zeros((), sums.dtype))
-        operand = operand + _picked(sums, source, operand.shape)
+        operand = operand + at_places(sums, source.reshape(operand.shape))
     before, to, order = (x[~is_often] for x in (before, to, order))
     source = np.full((1 + before.max(initial=-1), size), updates.size - 1)
     source[before, to] = order
-    add = lambda x, row: x + _picked(updates, row, operand.shape)
+    add = lambda x, row: x + at_places(updates, row.reshape(operand.shape))
     return functools.reduce(add, source, operand)
 
 
@@ -278,10 +279,6 @@ def _running(name: str, x: Array, *, axis: int, reverse: bool) -> Array:
 
 # Primitives that this module replaces, where their indices are known and sizes allow it.
 REWRITTEN = SCATTERS | CUMULATIVE | FACTORS | _OF_PAIRS.keys() | {CONTRACTION, LINEAR_SOLVE}
-
-
-def _picked(flat: Array, source: Array | np.ndarray, shape: tuple[int, ...]) -> Array:
-    return flat.at[source].get(mode="promise_in_bounds").reshape(shape)
 
 
 def places_of_updates(

@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from ..._programs import Indices, is_known, jacobian_pattern, summed
+from ..._programs import at_places, Indices, is_known, jacobian_pattern, summed
 from ..._types import Flag
 
 
@@ -24,7 +24,8 @@ class Places(Indices):
     """The rows of each block; the same for a matrix and its inverse.
 
     - `rows`: the rows of each block, shape `(blocks, size)`; the number of rows at padded
-      positions, where a block is smaller than the largest one.
+      positions, where a block is smaller than the largest one. `read`: the same with any
+      row at padded positions.
     - `padding`: ones on the diagonal at padded positions.
     - `back`: the position of each row in the blocks, and `within`: in its own block.
     """
@@ -37,6 +38,7 @@ class Places(Indices):
         within = np.arange(size) - starts[labels[order]]
         self.rows = np.full((sizes.size, sizes.max()), size)
         self.rows[labels[order], within] = order
+        self.read = np.minimum(self.rows, size - 1)
         self.padding = (self.rows == size)[:, :, None] * np.eye(sizes.max())
         self.back = np.zeros(size, int)
         self.back[order] = labels[order] * sizes.max() + within
@@ -63,15 +65,15 @@ class BlockDiagonal(eqx.Module):
         return self.blocks.dtype
 
     def __matmul__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        by_block = jnp.append(x, 0)[self.places.rows]
-        return summed(self.blocks * by_block[:, None, :]).ravel()[self.places.back]
+        by_block = at_places(x, self.places.read)[:, None, :]
+        return at_places(summed(self.blocks * by_block).ravel(), self.places.back)
 
     def __rmatmul__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         return self @ x  # symmetric
 
     def diagonal(self) -> Float[Array, " n"]:
         diagonals = jnp.diagonal(self.blocks, axis1=1, axis2=2)
-        return diagonals.ravel()[self.places.back]
+        return at_places(diagonals.ravel(), self.places.back)
 
 
 Symmetric: TypeAlias = Float[Array, "n n"] | BlockDiagonal

@@ -15,7 +15,7 @@ from jax.extend.core import jaxpr_as_fun
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from ..._programs import Indices, is_known, jacobian_pattern
+from ..._programs import at_places, Indices, is_known, jacobian_pattern
 from .dense import inverse
 
 
@@ -97,7 +97,7 @@ def solve_by_blocks(
         return inverse(matrix) @ right
     pieces = []
     for size, rows, columns in blocks.groups:
-        part = _take(right, rows)
+        part = at_places(right, rows)
         pieces.append(_solve(_blocks(matrix, rows, columns), part) if size else part)
     return _joined(pieces, blocks.of_columns)
 
@@ -108,7 +108,7 @@ def multiply_by_blocks(
     """`matrix @ x`, where each row depends on the columns of its own block only."""
     pieces = []
     for size, rows, columns in blocks.groups:
-        part = _take(x, columns)
+        part = at_places(x, columns)
         pieces.append(_times(_blocks(matrix, rows, columns), part) if size else part)
     return _joined(pieces, blocks.of_rows)
 
@@ -120,20 +120,12 @@ _FEW = 8
 def _blocks(matrix: Array, rows: np.ndarray, columns: np.ndarray) -> Array:
     if len(rows) > _FEW:
         return matrix[rows[:, :, None], columns[:, None, :]]
-    cut = lambda r, c: _take(_take(matrix, r).T, c).T
+    cut = lambda r, c: at_places(at_places(matrix, r).T, c).T
     return jnp.stack([cut(r, c) for r, c in zip(rows, columns, strict=True)])
 
 
-def _take(x: Array, indices: np.ndarray) -> Array:
-    """`x[indices]`, as a slice if the indices are contiguous: XLA can fuse slices."""
-    first, last = indices.flat[0], indices.flat[-1] + 1
-    if np.array_equal(indices.ravel(), np.arange(first, last)):
-        return x[first:last].reshape(*indices.shape, *x.shape[1:])
-    return x[indices]
-
-
 def _joined(pieces: list[Array], order: np.ndarray) -> Array:
-    return _take(jnp.concatenate([x.ravel() for x in pieces]), order)
+    return at_places(jnp.concatenate([x.ravel() for x in pieces]), order)
 
 
 @jax.custom_jvp

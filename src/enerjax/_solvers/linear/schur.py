@@ -20,7 +20,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from ..._programs import Indices, jacobian_pattern, shape_of, summed, unmerged
+from ..._programs import at_places, Indices, jacobian_pattern, shape_of, summed, unmerged
 from .block_diagonal import BlockDiagonal, Symmetric
 from .block_tridiagonal import block_sizes, coloured_products, column_colours
 
@@ -37,16 +37,20 @@ class SchurTables(Indices):
     """The index tables by which the entries of `B` and `G` are found.
 
     They are constructed at trace time. A row of `B` is stored as segments, one for each
-    block of `W` in which it has entries. Indices of absent entries are one past the end.
+    block of `W` in which it has entries. Indices of absent entries are one past the end,
+    except where what is read is multiplied by zero or not used; then they are any index.
 
     - `colours`: the colours of the columns of `B`. Columns of equal colour share no row.
     - `touched`: the block of `W` of each segment, shape `(rows, segments)`.
-    - `columns`: the unknowns of each segment, shape `(rows, segments, size)`.
+    - `columns`: the unknowns of each segment, shape `(rows, segments, size)`; `read`: the
+      same with any unknown for absent ones.
     - `entries`: the index of each entry of the segments in the coloured products.
-    - `transposed`: the indices of the entries of each column of `B` in the segments.
+    - `transposed`: the indices of the entries of each column of `B` in the segments, and
+      `rows_of_column`: their rows, or any row for absent ones.
     - `diagonal`, `below`: for each block of `G`, on and below the diagonal, the indices in
       the segments of the entries that it is computed from; see `_shared`.
-    - `order`: the row of `G` at each position of its blocks.
+    - `order`: the row of `G` at each position of its blocks, or any row beyond the end of
+      a short block.
     - `back`: the position of each row of `G` in its blocks.
     - `padding`: ones on the diagonal where a block is smaller than the largest one.
     """
@@ -72,6 +76,7 @@ class SchurTables(Indices):
         )
         none = np.full((1, blocks.shape[1]), size)
         self.columns = np.concatenate([blocks, none])[self.touched]
+        self.read = np.minimum(self.columns, size - 1)
         self._find_entries(rows, columns, size)
         self._cut(incidence)
 
@@ -96,6 +101,8 @@ class SchurTables(Indices):
         within = np.arange(order.size) - np.repeat(np.cumsum(counts) - counts, counts)
         self.transposed = np.full((size, counts.max(initial=1)), known.size)
         self.transposed[columns[order], within] = places[order]
+        per_row = known.size // self.num_rows
+        self.rows_of_column = np.minimum(self.transposed // per_row, self.num_rows - 1)
 
     def _cut(self, incidence: "scipy.sparse.csr_array") -> None:
         coupling = scipy.sparse.csr_array(incidence @ incidence.T)
@@ -106,9 +113,10 @@ class SchurTables(Indices):
         within = np.arange(self.num_rows) - (np.cumsum(sizes) - sizes)[number]
         self.back = np.empty(self.num_rows, int)
         self.back[order] = number * self.width + within
-        self.order = np.full(sizes.size * self.width, self.num_rows)
-        self.order[self.back] = np.arange(self.num_rows)
-        along = self.order.reshape(self.num_blocks, self.width)
+        order = np.full(sizes.size * self.width, self.num_rows)
+        order[self.back] = np.arange(self.num_rows)
+        self.order = np.minimum(order, self.num_rows - 1)
+        along = order.reshape(self.num_blocks, self.width)
         self.padding = (along == self.num_rows)[:, :, None] * np.eye(self.width)
         self.diagonal = self._shared([(rows, rows) for rows in along])
         self.below = self._shared([(after, rows) for rows, after in pairwise(along)])
@@ -138,37 +146,38 @@ class SchurTables(Indices):
 class Schur(eqx.Module):
     """`B`, and the block factorisation of `G = B W B^T`.
 
-    - `rows`: the segments of the rows of `B`; see `SchurTables`.
+    - `rows`: the segments of the rows of `B`; see `SchurTables`. `columns`: the entries of
+      its columns, which are zero where they are absent.
     - `factors`: the blocks below the diagonal of the unit lower triangular factor.
     - `inverses`: the inverses of the diagonal blocks.
     """
 
     tables: SchurTables = eqx.field(static=True)
     rows: Float[Array, "rows segments size"]
+    columns: Float[Array, "n entries"]
     factors: Float[Array, "below width width"]
     inverses: Float[Array, "blocks width width"]
 
     def product(self, u: Float[Array, " n"]) -> Float[Array, " rows"]:
         """`B u`"""
-        return summed(self.rows * jnp.append(u, 0)[self.tables.columns], 2)
+        return summed(self.rows * at_places(u, self.tables.read), 2)
 
     def transposed(self, x: Float[Array, " rows"]) -> Float[Array, " n"]:
         """`B^T x`"""
-        entries = jnp.append((self.rows * x[:, None, None]).ravel(), 0)
-        return summed(entries[self.tables.transposed])
+        return summed(self.columns * at_places(x, self.tables.rows_of_column))
 
     def solve(self, right: Float[Array, "k rows"]) -> Float[Array, "k rows"]:
         """`G^-1` times each of `k` vectors."""
         tables = self.tables
         count = right.shape[0]
-        padded = jnp.concatenate([right, jnp.zeros((count, 1), right.dtype)], axis=1)
-        along = padded[:, tables.order].reshape(count, tables.num_blocks, tables.width)
-        along = jnp.moveaxis(along, 1, 0)
+        along = at_places(right.T, tables.order)
+        along = along.reshape(tables.num_blocks, tables.width, count)
+        along = jnp.swapaxes(along, 1, 2)
         if tables.num_blocks == 1:
             along = _products(self.inverses, along)
         else:
             along = self._substituted(along)
-        return jnp.moveaxis(along, 0, 1).reshape(count, -1)[:, tables.back]
+        return at_places(jnp.swapaxes(along, 1, 2).reshape(-1, count), tables.back).T
 
     def _substituted(
         self, along: Float[Array, "blocks k width"]
@@ -226,9 +235,10 @@ def schur(
     # compute it again for each use.
     rows, weighted = unmerged(functools.partial(_weighted, tables))(products, weight)
     diagonal, below = _blocks(tables, rows, weighted)
+    columns = at_places(jnp.append(rows.ravel(), 0), tables.transposed)
     if tables.num_blocks == 1:
         none = jnp.zeros((0, tables.width, tables.width), at.dtype)
-        return Schur(tables, rows, none, _inverse(diagonal[0])[None])
+        return Schur(tables, rows, columns, none, _inverse(diagonal[0])[None])
 
     def eliminate(before, item):
         own, below = item
@@ -238,17 +248,18 @@ def schur(
 
     first = _inverse(diagonal[0])
     _, (factors, inverses) = jax.lax.scan(eliminate, first, (diagonal[1:], below))
-    return Schur(tables, rows, factors, jnp.concatenate([first[None], inverses]))
+    inverses = jnp.concatenate([first[None], inverses])
+    return Schur(tables, rows, columns, factors, inverses)
 
 
 def _weighted(
     tables: SchurTables, products: Float[Array, "rows colours"], weight: Symmetric
 ) -> tuple[Array, Array]:
     """The segments of the rows of `B`, and of `B W`."""
-    rows = jnp.append(products.ravel(), 0)[tables.entries]
+    rows = at_places(jnp.append(products.ravel(), 0), tables.entries)
     if isinstance(weight, BlockDiagonal):
         none = jnp.zeros((1, *weight.blocks.shape[1:]), rows.dtype)
-        blocks = jnp.concatenate([weight.blocks, none])[tables.touched]
+        blocks = at_places(jnp.concatenate([weight.blocks, none]), tables.touched)
     else:
         blocks = weight[None, None]
     return rows, summed(blocks * rows[:, :, None, :])
@@ -259,7 +270,8 @@ def _blocks(tables: SchurTables, rows: Array, weighted: Array) -> tuple[Array, A
     left, right = (jnp.append(x.ravel(), 0) for x in (weighted, rows))
 
     def blocks(table: np.ndarray) -> Array:
-        one, other = unmerged(lambda x, y: (x[table[0]], y[table[1]]))(left, right)
+        taken = lambda x, y: (at_places(x, table[0]), at_places(y, table[1]))
+        one, other = unmerged(taken)(left, right)
         terms = (one[:, k, :, None] * other[:, k, None] for k in range(table.shape[2]))
         shape = (table.shape[1], tables.width, tables.width)
         return functools.reduce(jnp.add, terms, jnp.zeros(shape, rows.dtype))
