@@ -468,6 +468,22 @@ class AbstractModel(eqx.Module):
             return None
         return jnp.full((count,), -(float(jnp.finfo(dtype).eps) ** 0.5), dtype)
 
+    @property
+    def delassus_regularisation(self) -> JointMultipliers | None:
+        """What is added to the diagonal of the Delassus matrix; `None` for a system whose
+        constraints are declared to be independent.
+
+        It is a small part of the diagonal. The multipliers have the same norm as with
+        `regularisation`.
+        """
+        if not self.system.redundant:
+            return None
+        scales = self.scales
+        relations = jax.eval_shape(self.coordinate, scales.coordinate).size
+        joints = scales.constraint[: scales.constraint.size - relations]
+        eps = float(jnp.finfo(joints.dtype).eps)
+        return eps**_REGULARISATION * joints**2
+
     def regularisation_after(self, x: Array, count: int) -> Float[Array, " n"] | None:
         """The regularisation of equations for `x`, where it is zero, and multipliers."""
         numbers = self.regularisation(count, x.dtype)
@@ -565,6 +581,9 @@ def row_scales(
 
 # The evaluation of a term takes a few operations, each with a rounding error.
 _OPERATIONS_PER_TERM = 4.0
+# The power of the machine epsilon by which the Delassus matrix is regularised. The square
+# of the number must be far above round-off, and it must be far below the eigenvalues.
+_REGULARISATION = 0.375
 # The number of changes of the inputs from which the size of a term is estimated.
 _DRAWS = 3
 

@@ -41,8 +41,7 @@ class CanonicalModel(AbstractModel):
         self.args = args
         state = self.to_internal(state)
         self.scales = self._scales(state)
-        # Redundant constraints make the matrix singular.
-        self.constraint_tables = None if system.redundant else self._tables(state)
+        self.constraint_tables = self._tables(state)
 
     def with_known_zeros(self, state: State) -> "CanonicalModel":
         # The inertia is a function of the coordinates, evaluated where it is needed.
@@ -305,8 +304,9 @@ class CanonicalModel(AbstractModel):
         if self.constraint_tables is None:
             return DelassusMatrix(weight, None, None)
         rest = jnp.zeros_like(state.q)
-        rows = schur(self.constraint_tables, self._rates_of_joints(state), rest, weight)
-        return DelassusMatrix(weight, rows, None)
+        added, rates = self.delassus_regularisation, self._rates_of_joints(state)
+        rows = schur(self.constraint_tables, rates, rest, weight, added)
+        return DelassusMatrix(weight, rows, None, added)
 
     def _tables(self, state: State) -> SchurTables | None:
         rest = jnp.zeros_like(state.q)

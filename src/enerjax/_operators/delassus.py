@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from .._solvers import Schur, Symmetric
 from .._system import Frames
-from .._types import Increments, Multipliers, Velocities
+from .._types import Increments, JointMultipliers, Multipliers, Velocities
 from .interval import Increment
 
 
@@ -35,11 +35,14 @@ class DelassusMatrix(eqx.Module):
       columns for the rates of the coordinate constraints, with a weight of zero. `None` if
       there are no joints.
     - `frames`: the map to the rates of redundant coordinates; `None` if there are none.
+    - `regularisation`: the diagonal matrix `E` that has been added to `G` before it was
+      factorised, where joints may be redundant; else `None`.
     """
 
     inverse_inertia: Symmetric
     schur: Schur | None
     frames: Frames | None
+    regularisation: JointMultipliers | None = None
 
     def product(self, velocity: Velocities) -> Multipliers:
         """`C velocity`, the rates of change of the joints."""
@@ -60,8 +63,34 @@ class DelassusMatrix(eqx.Module):
         return self.inverse_inertia @ self.force(impulses)
 
     def solve(self, right: Float[Array, "k nc"]) -> Float[Array, "k nc"]:
-        """`G^-1` times each of `k` vectors."""
-        return right if self.schur is None else self.schur.solve(right)
+        """`G^-1` times each of `k` vectors.
+
+        Where `G` may be singular it is `(G + E)^-1 G (G + E)^-1` instead, which is nearly
+        the inverse in the range of `G`, and zero in its null space: `(G + E)^-1` would
+        divide round-off there by a small number.
+        """
+        if self.schur is None:
+            return right
+        found = self.schur.solve(right)
+        if self.regularisation is None:
+            return found
+        return found - self.schur.solve(self.regularisation[None] * found)
+
+    def effective(self, multipliers: Multipliers) -> Multipliers:
+        """Multipliers of the joints without their part in the null space of `G`.
+
+        It causes no force, and no row of the step equations determines it. The rest has the
+        least norm, weighted by `E`.
+        """
+        no_part = self.schur is None or self.regularisation is None
+        if no_part or multipliers.size == 0:
+            return multipliers
+        joints = multipliers[: self.schur.tables.num_rows]
+        null = joints[None]
+        # The second pass removes the error of first order in `E`.
+        for _ in range(2):
+            null = self.schur.solve(self.regularisation[None] * null)
+        return multipliers.at[: joints.size].add(-null[0])
 
     def reduced(self, rows: Increment) -> Reduced:
         """The rows of a node, with the coordinate constraints taken out."""

@@ -460,8 +460,9 @@ class SeparableModel(AbstractModel):
         frames = self._frames(state.q)
         rates, weight = self._rates_of_joints(state.q, state.t, frames), self._weight()
         rest = jnp.zeros((weight.shape[0],), state.q.dtype)
-        rows = schur(self.constraint_tables, rates, rest, weight)
-        return DelassusMatrix(self.inverse_inertia, rows, frames)
+        added = self.delassus_regularisation
+        rows = schur(self.constraint_tables, rates, rest, weight, added)
+        return DelassusMatrix(self.inverse_inertia, rows, frames, added)
 
     def _frames(self, q: Coordinates) -> Frames | None:
         """`L` stacked on `B_c`, where coordinates are redundant."""
@@ -482,9 +483,6 @@ class SeparableModel(AbstractModel):
         return padded(self.inverse_inertia, num_relations)
 
     def _constraint_tables(self, state: State) -> SchurTables | None:
-        # Redundant constraints make the matrix singular.
-        if self.system.redundant:
-            return None
         t = jnp.zeros((), state.q.dtype) if self.system.is_timed else None
         weight = self._weight()
         rates = self._rates_of_joints(state.q, t, self._frames(state.q))

@@ -1,5 +1,6 @@
 """Entries at places that are known while a program is traced."""
 
+import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Int
@@ -14,10 +15,12 @@ def at_places(x: Array, places: Int[np.ndarray, "*places"]) -> Array:
     """
     flat = places.ravel()
     shape = *places.shape, *x.shape[1:]
+    if flat.size == 0:
+        return x[:0].reshape(shape)
     step = int(flat[1] - flat[0]) if flat.size > 1 else 1
     if step > 0 and np.array_equal(flat, flat[:1] + step * np.arange(flat.size)):
         is_whole = step == 1 and flat.size == x.shape[0]
         taken = x if is_whole else lax.slice_in_dim(x, flat[0], flat[-1] + 1, step)
         return taken.reshape(shape)
-    found = x.at[places.astype(np.int32)]
+    found = jnp.asarray(x).at[places.astype(np.int32)]
     return found.get(mode="promise_in_bounds", wrap_negative_indices=False)

@@ -14,7 +14,7 @@ from .._operators import AbstractModel
 from .._programs import in_any_lane
 from .._results import first_failure, may_need_newton, RESULTS
 from .._solvers import ChordAlone, Newton, RootFinder
-from .._system import AbstractSystem, State
+from .._system import State
 from .._types import Count, Flag, Multipliers, Scalar
 from ..schemes import AbstractScheme, AbstractSchemeWithChord, Energies
 from .event_search import Found, no_search, settle, Watch
@@ -400,7 +400,6 @@ def dispensable_newton(
     scheme: AbstractScheme,
     plan: AbstractPlan,
     watcher: Watcher | None,
-    system: AbstractSystem,
 ) -> Newton | None:
     """Newton's method of a run whose steps may be tried by the chord method alone, else
     `None`."""
@@ -409,7 +408,6 @@ def dispensable_newton(
         or not isinstance(scheme.stage, AbstractSchemeWithChord)
         or not isinstance(plan, EqualPlan)
         or watcher is not None
-        or system.redundant
     ):
         return None
     return root_finder
@@ -429,7 +427,7 @@ def for_lanes(stepper: Stepper, begin: Progress) -> Callable[[], Stepper] | None
     """
     model = stepper.model
     newton = dispensable_newton(
-        stepper.root_finder, stepper.scheme, stepper.plan, stepper.watcher, model.system
+        stepper.root_finder, stepper.scheme, stepper.plan, stepper.watcher
     )
     if (
         newton is None

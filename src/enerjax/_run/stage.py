@@ -6,6 +6,7 @@ guesses are the unknowns of a free flight, which is a step without forces, plus 
 extrapolation of the differences between the last steps and their free flights.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -28,7 +29,7 @@ from .._solvers import (
     RowPattern,
 )
 from .._system import State
-from .._types import Count, Flag, Multipliers, Scalar, Velocities
+from .._types import Count, Flag, JointMultipliers, Multipliers, Scalar, Velocities
 from ..schemes import (
     AbstractOneSolveScheme,
     AbstractSchemeWithChord,
@@ -301,7 +302,15 @@ def _chord(scheme: AbstractOneSolveScheme) -> Chord:
         correction = scheme.chord(rows, problem, matrix)
         return jax.tree.map(jnp.multiply, correction, per_unknown)
 
-    return Chord(prepare, correct)
+    def effective(x, inputs, matrix):
+        if matrix.regularisation is None:
+            return x
+        _, _, (unknown_scale, _), (per_unknown, _) = inputs
+        new = lambda z: tuple(map(matrix.effective, _multipliers(z)))
+        z = _with_multipliers(jax.tree.map(jnp.multiply, x, unknown_scale), new)
+        return jax.tree.map(jnp.multiply, z, per_unknown)
+
+    return Chord(prepare, correct, effective)
 
 
 def num_unknowns(memory: Memory) -> int:
@@ -325,12 +334,23 @@ def _gradients_reverse(model: AbstractModel, a: State, b: State) -> Flag:
     return jnp.any(jnp.sum(before * after, axis=1) < 0)
 
 
-def _with_multipliers(z: PyTree[Any], values: PyTree[Any]) -> PyTree[Any]:
-    """The tree `z` with the multipliers of `values`."""
-    parts = lambda x: (x.impulse, x.velocity_impulse)
+def _with_multipliers(
+    z: PyTree[Any], new: Callable[..., tuple[Array, ...]], *others: PyTree[Any]
+) -> PyTree[Any]:
+    """The tree `z` with the multipliers `new(x, *y)` for each increment `x` in it.
+
+    `y` are those at the same place of the trees `others`.
+    """
     is_increment = lambda x: isinstance(x, Increment)
-    change = lambda x, y: eqx.tree_at(parts, x, parts(y)) if is_increment(x) else x
-    return jax.tree.map(change, z, values, is_leaf=is_increment)
+
+    def change(x: Any, *y: Any) -> Any:
+        return eqx.tree_at(_multipliers, x, new(x, *y)) if is_increment(x) else x
+
+    return jax.tree.map(change, z, *others, is_leaf=is_increment)
+
+
+def _multipliers(x: Increment) -> tuple[Multipliers, JointMultipliers]:
+    return x.impulse, x.velocity_impulse
 
 
 def _regularisation(model: AbstractModel, unknown_scale: Any, row_scale: Any) -> Any | None:
@@ -348,7 +368,8 @@ def _regularisation(model: AbstractModel, unknown_scale: Any, row_scale: Any) ->
         return share * jnp.asarray(model.regularisation(unit.size, unit.dtype))
 
     none = jax.tree.map(jnp.zeros_like, unknown_scale)
-    return _with_multipliers(none, jax.tree.map(weighted, unknown_scale, row_scale))
+    weights = jax.tree.map(weighted, unknown_scale, row_scale)
+    return _with_multipliers(none, lambda _, of: _multipliers(of), weights)
 
 
 def free_flight(

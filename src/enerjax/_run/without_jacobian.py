@@ -58,7 +58,7 @@ def chord_alone(task: Task, values: Task) -> Task | None:
     """
     system = values.system
     newton = dispensable_newton(
-        values.root_finder, values.scheme, values.plan, values.watcher, system
+        values.root_finder, values.scheme, values.plan, values.watcher
     )
     if newton is None:
         return None

@@ -189,10 +189,11 @@ def find_root(
     of_chord = None
     if chord is not None:
         of_chord, prepare = _explicit_closure(chord.prepare, guess, args)
-        correct = chord.correct
+        correct, effective = chord.correct, chord.effective
         chord = Chord(
             lambda y, inputs: prepare(inputs[2], y, inputs[1]),
             lambda value, inputs, prepared: correct(value, inputs[1], prepared),
+            lambda y, inputs, prepared: effective(y, inputs[1], prepared),
         )
     inputs = traced, args, of_chord, regularisation
     return _root(call, chord, root_finder, inputs, start, max_iterations)

@@ -31,10 +31,13 @@ class Chord(NamedTuple):
     - `prepare(y, args)`: factorises the approximate Jacobian at the guess `y`.
     - `correct(value, args, prepared)`: the correction for the residual `value`, where
       `prepared` is the result of `prepare`.
+    - `effective(y, args, prepared)`: `y` without its part that the equations leave open;
+      no correction has such a part.
     """
 
     prepare: Callable[[PyTree[Array], Any], PyTree]
     correct: Callable[[PyTree[Array], Any, PyTree], PyTree[Array]]
+    effective: Callable[[PyTree[Array], Any, PyTree], PyTree[Array]] = lambda y, *_: y
 
 
 class Root(eqx.Module):
@@ -166,8 +169,13 @@ def _by_chord(
     start: Start,
     patience: int,
 ) -> Root:
-    guess, unravel = ravel_pytree(start.guess)
-    prepared = part(lambda: chord.prepare(start.guess, args))()
+    _, unravel = ravel_pytree(start.guess)
+
+    def begin() -> tuple[PyTree, Array]:
+        prepared = chord.prepare(start.guess, args)
+        return prepared, ravel_pytree(chord.effective(start.guess, args, prepared))[0]
+
+    prepared, guess = part(begin)()
     leaves_of = lambda tree: tuple(jax.tree.leaves(tree))
     joined = lambda leaves: jnp.concatenate([x.ravel() for x in leaves])
 

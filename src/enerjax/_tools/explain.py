@@ -107,7 +107,7 @@ def _explained(
     root_finder: RootFinder,
 ) -> Explanation:
     plan = EqualSteps().plan(scheme, h, jnp.zeros_like(h), End(num_steps=1))
-    dispensable = dispensable_newton(root_finder, scheme, plan, None, model.system)
+    dispensable = dispensable_newton(root_finder, scheme, plan, None)
     search = root_finder
     if dispensable is not None:
         search = ChordAlone(dispensable, MOST_BY_NEWTON)

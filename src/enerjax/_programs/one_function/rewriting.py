@@ -180,7 +180,9 @@ def _scattered(name: str, values: list[Any], params: dict[str, Any]) -> Array:
     if name == "scatter":
         source, falls = np.arange(size), places >= 0
         source[places[falls]] = size + np.flatnonzero(falls)
-        return at_places(jnp.append(jnp.ravel(operand), updates), source.reshape(operand.shape))
+        return at_places(
+            jnp.append(jnp.ravel(operand), updates), source.reshape(operand.shape)
+        )
     order = np.argsort(places, kind="stable")
     order = order[places[order] >= 0]
     to = places[order]

@@ -4,8 +4,8 @@ It is the matrix of the equations for the multipliers of constraints with gradie
 where `W` is the inverse inertia. Two constraints are coupled in `G` only if they act on a
 common body, so `G` is as sparse as the graph of the mechanism. Its rows are numbered by the
 reverse Cuthill-McKee algorithm and divided into blocks, so that `G` is block tridiagonal,
-and it is eliminated block by block. `G` is symmetric and positive definite, so the
-elimination needs no pivoting.
+and it is eliminated block by block. `G` is symmetric and positive definite, or is made so
+by a regularisation where constraints are redundant, so the elimination needs no pivoting.
 """
 
 import functools
@@ -228,13 +228,20 @@ def schur(
     fn: Callable[[Array], Array],
     at: Float[Array, " n"],
     weight: Symmetric,
+    regularisation: Float[Array, " rows"] | None = None,
 ) -> Schur:
-    """The factorised `G`, where `B` is the Jacobian of `fn` at a point."""
+    """The factorised `G`, where `B` is the Jacobian of `fn` at a point.
+
+    With a `regularisation`, this is added to the diagonal of a `G` that may be singular.
+    """
     products = coloured_products(fn, at, tables.colours)
     # Compiled separately, because each entry is used many times, and XLA would otherwise
     # compute it again for each use.
     rows, weighted = unmerged(functools.partial(_weighted, tables))(products, weight)
     diagonal, below = _blocks(tables, rows, weighted)
+    if regularisation is not None:
+        added = at_places(regularisation, tables.order).reshape(-1, tables.width, 1)
+        diagonal = diagonal + added * jnp.eye(tables.width, dtype=added.dtype)[None]
     columns = at_places(jnp.append(rows.ravel(), 0), tables.transposed)
     if tables.num_blocks == 1:
         none = jnp.zeros((0, tables.width, tables.width), at.dtype)
