@@ -82,14 +82,14 @@ class DelassusMatrix(eqx.Module):
         It causes no force, and no row of the step equations determines it. The rest has the
         least norm, weighted by `E`.
         """
-        no_part = self.schur is None or self.regularisation is None
-        if no_part or multipliers.size == 0:
+        schur, added = self.schur, self.regularisation
+        if schur is None or added is None or multipliers.size == 0:
             return multipliers
-        joints = multipliers[: self.schur.tables.num_rows]
+        joints = multipliers[: schur.tables.num_rows]
         null = joints[None]
         # The second pass removes the error of first order in `E`.
         for _ in range(2):
-            null = self.schur.solve(self.regularisation[None] * null)
+            null = schur.solve(added[None] * null)
         return multipliers.at[: joints.size].add(-null[0])
 
     def reduced(self, rows: Increment) -> Reduced:
