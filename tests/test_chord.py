@@ -12,7 +12,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import enerjax as ej
-from enerjax._operators import make_model
+from enerjax._operators import DelassusMatrix, make_model
 from enerjax._run import without_jacobian
 from enerjax._run.prediction import extrapolated
 from enerjax._solvers import Chord, find_root, Newton, schur, schur_tables
@@ -79,6 +79,38 @@ def test_the_matrix_of_the_multipliers_is_that_of_dense_algebra(graph, coupled):
     np.testing.assert_allclose(
         found.solve(jnp.asarray(x)), np.linalg.solve(matrix, x.T).T, rtol=0, atol=atol
     )
+
+
+@pytest.mark.parametrize("copies", [1, 3])
+def test_the_matrix_of_redundant_rows_is_that_of_the_pseudo_inverse(copies):
+    """Rows of which some follow from others, and the norm that weighs each."""
+    rng = np.random.default_rng(1)
+    independent = jnp.asarray(rng.normal(size=(4, 9)))
+    combined = jnp.asarray(rng.normal(size=(copies, 4))) @ independent
+    rows = lambda u: jnp.concatenate([independent, combined]) @ u
+    at, weight = jnp.zeros(9), jnp.asarray(np.diag(rng.uniform(1, 2, 9)))
+    jacobian = np.asarray(jax.jacfwd(rows)(at))
+    matrix = jacobian @ np.asarray(weight) @ jacobian.T
+    measure = rng.uniform(1, 2, len(matrix))
+    eps = 1e-6
+    added = jnp.asarray(eps * measure**2)
+    tables = schur_tables(rows, at, weight)
+    assert tables is not None
+    found = DelassusMatrix(weight, schur(tables, rows, at, weight, added), None, added)
+    x = rng.normal(size=len(matrix))
+    solved = np.asarray(found.solve(jnp.asarray(x[None])))[0]
+    # Truncation: of first order in what is added. Round-off is divided by its square.
+    size = np.max(np.linalg.svd(np.linalg.pinv(matrix, rcond=1e-10))[1])
+    null = np.linalg.svd(jacobian.T / measure)[2][4:]
+    in_range = x - measure * (null.T @ (null @ (x / measure)))
+    np.testing.assert_allclose(matrix @ solved, in_range, atol=100 * eps * size)
+    scale = np.linalg.norm(x)
+    assert np.max(np.abs(null @ (measure * solved))) <= 1e3 * EPS / eps**2 * scale
+    effective = np.asarray(found.effective(jnp.asarray(x)))
+    # Truncation, of second order, and round-off divided by what is added.
+    atol = 1e3 * ((eps * size) ** 2 + EPS / eps) * scale
+    np.testing.assert_allclose(jacobian.T @ effective, jacobian.T @ x, atol=atol)
+    np.testing.assert_allclose(null @ (measure * effective), 0, atol=atol)
 
 
 # The corrections of the schemes -----------------------------------------------------------

@@ -193,10 +193,8 @@ def test_zero_as_a_python_number_leaves_the_dissipation_out():
 
     height = lambda scheme: run(scheme).ys.q[-1, 1]
     assert eqx.filter_grad(height)(ej.EnergyConsistent(0.0)).alpha is None
-    slope = eqx.filter_grad(height)(ej.EnergyConsistent(jnp.array(0.0))).alpha
-    by_number = jax.grad(lambda alpha: height(ej.EnergyConsistent(alpha)))(0.0)
+    slope = jax.grad(lambda alpha: height(ej.EnergyConsistent(alpha)))(0.0)
     assert abs(slope) > 1e-9
-    assert by_number == pytest.approx(float(slope), rel=1e-9)
 
 
 def test_transformations_keep_the_order():

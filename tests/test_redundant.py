@@ -119,6 +119,25 @@ def test_multipliers_are_of_least_norm():
         np.testing.assert_allclose(mean, least, atol=100 * h)  # truncation: of five steps
 
 
+def test_the_chord_method_solves_redundant_constraints():
+    """Its multipliers are those of least norm in the middle of each step."""
+    system, args = _beam(4, redundant=True)
+    start = _start(system, args)
+    assert "chord" in str(ej.explain(system, ej.EnergyPreserving(), start, args))
+    run = ej.simulate(system, ej.EnergyPreserving(), start, args, h=1e-3, num_steps=20)
+    assert np.max(run.stats.newton_iterations) <= 6
+    assert system.constraint is not None
+    q = np.asarray(run.ys.q)
+    jacobian = jax.jacfwd(system.constraint)
+    # The measure of the multipliers is that of the start.
+    size = np.linalg.norm(jacobian(start.q, args), axis=1)
+    for before, after, found in zip(q[3:], q[4:], run.multipliers[4:], strict=False):
+        middle = np.asarray(jacobian(jnp.asarray(0.5 * (before + after)), args))
+        null = np.linalg.svd((middle / size[:, None]).T)[2][3:]
+        # Solver: the matrix is that at the first guess.
+        assert np.max(np.abs(null @ (size * np.asarray(found)))) <= 1e-8 * G
+
+
 @pytest.mark.slow
 def test_derivatives_are_unique():
     def tip(l, num_bars, redundant):

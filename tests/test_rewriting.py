@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import enerjax as ej
-from enerjax._programs import in_one_function
+from enerjax._programs import at_places, in_one_function, why_not_one_function
 
 from .helpers import long
 from .test_one_function import is_marked, pytestmark
@@ -171,3 +171,36 @@ def test_scenes_are_one_function(name):
         system, ej.EnergyPreserving(), start, args, h=1e-3, num_steps=20, throw=False
     )
     assert is_marked(run, args)
+
+
+@pytest.mark.parametrize(("num_pivots", "num_rows"), [(5, 9), (16, 16), (20, 40)])
+def test_the_order_of_rows_after_their_exchanges(num_pivots, num_rows):
+    rng = np.random.default_rng(0)
+    first = np.arange(num_pivots)
+    pivots = jnp.asarray(rng.integers(first, num_rows), jnp.int32)
+    expected = np.arange(num_rows)
+    for k, pivot in enumerate(np.asarray(pivots)):
+        expected[[k, pivot]] = expected[[pivot, k]]
+    order = lambda pivots: jax.lax.linalg.lu_pivots_to_permutation(pivots, num_rows)
+    assert not why_not_one_function(order, pivots)
+    np.testing.assert_array_equal(jax.jit(in_one_function(order))(pivots), expected)
+
+
+@pytest.mark.parametrize(
+    ("places", "operation"),
+    [
+        (np.arange(12), "no operation"),
+        (np.arange(2, 8).reshape(2, 3), "slice"),
+        (np.arange(1, 12, 3), "slice"),
+        (np.array([5]), "slice"),
+        (np.array([[3, 3], [0, 7]]), "gather"),
+        (np.array([4, 3, 2]), "gather"),
+        (np.zeros((2, 0), int), "slice"),
+    ],
+)
+def test_entries_at_known_places(places, operation):
+    x = jnp.arange(24.0).reshape(12, 2)
+    np.testing.assert_array_equal(at_places(x, places), np.asarray(x)[places])
+    program = jax.make_jaxpr(lambda x: at_places(x, places))(x)
+    names = {eqn.primitive.name for eqn in program.jaxpr.eqns}
+    assert names & {"slice", "gather"} == {operation} - {"no operation"}

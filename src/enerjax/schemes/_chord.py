@@ -28,8 +28,8 @@ def step_chord(rows: Increment, delassus: DelassusMatrix) -> Increment:
         return _with_momenta(found, rows, momentum)
     reduced = delassus.reduced(rows)
     inner = reduced.rows
-    free = 0.5 * (delassus.inverse_inertia @ inner.rate)
-    impulse = delassus.product(free) - inner.impulse
+    free = delassus.inverse_inertia @ inner.rate
+    impulse = 0.5 * delassus.product(free) - inner.impulse
     if inner.velocity_impulse.size == 0:
         (impulse,) = delassus.solve(impulse[None])
         reaction = inner.velocity_impulse
@@ -41,7 +41,7 @@ def step_chord(rows: Increment, delassus: DelassusMatrix) -> Increment:
     relations = reduced.normal - delassus.normal_forces(2 * both)
     return Increment(
         impulse=jnp.concatenate([2 * both, relations]),
-        rate=delassus.rates(free - delassus.velocity(impulse), reduced),
+        rate=delassus.rates(0.5 * free - delassus.velocity(impulse), reduced),
         momentum=rows.momentum,
         velocity_impulse=reaction,
     )
