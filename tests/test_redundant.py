@@ -9,6 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import enerjax as ej
+from enerjax._operators import make_model
 
 from .helpers import EPS, SCHEMES
 
@@ -136,6 +137,53 @@ def test_the_chord_method_solves_redundant_constraints():
         null = np.linalg.svd((middle / size[:, None]).T)[2][3:]
         # Solver: the matrix is that at the first guess.
         assert np.max(np.abs(null @ (size * np.asarray(found)))) <= 1e-8 * G
+
+
+@pytest.mark.slow
+def test_relations_between_coordinates_have_no_part_in_the_norm():
+    """A body with Euler parameters on two coaxial hinges shares its weight as any other."""
+    box = ej.bodies.QuaternionBody("box", 1.0, [0.3, 0.4, 0.5], [0.1, 0.0, 0.0])
+    hinge = lambda name, height: ej.joints.Revolute(
+        name, "ground", "box", [0.0, 0.0, height], axis=[0.0, 0.0, 1.0]
+    )
+    scene = ej.Scene(
+        [hinge("top", 1.0), box, hinge("foot", -0.3)],
+        gravity=[0.0, -2.0, -G],
+        redundant=True,
+    )
+    system, start, args = scene.build()
+    model = make_model(system, start, args)
+    rates = jax.jacfwd(lambda v: model.joint_rate(start.q, v, None))(jnp.zeros(6))
+    inverse = np.diag([1, 1, 1, 1 / 0.3, 1 / 0.4, 1 / 0.5])
+    size = np.asarray(model.scales.constraint)[:10]
+    unit = np.asarray(rates) / size[:, None]
+    load = np.array([0.0, -2.0, -G, 0.0, 0.0, 0.0])
+    matrix, right = unit @ inverse @ unit.T, unit @ inverse @ load
+    least = np.linalg.pinv(matrix, rcond=1e-9) @ right / size
+    found = ej.consistent_start(system, start.q, start.v, args).multipliers[:10]
+    # Round-off of forces of some 10, divided by what makes the equations regular.
+    np.testing.assert_allclose(found, least, atol=10 * EPS**0.5)
+    run = ej.simulate(system, ej.EnergyPreserving(), start, args, h=1e-3, num_steps=4)
+    # Truncation: it begins to swing.
+    np.testing.assert_allclose(run.multipliers[1, :10], least, atol=1e-4)
+
+
+def test_rods_that_contradict_each_other_are_not_followed():
+    """A point on two rods whose feet are nearly the same cannot move."""
+
+    def rods(q, foot):
+        other = jnp.stack([q[0] - foot, q[1]])
+        length = (0.6 - foot) ** 2 + 0.64
+        third = q[2:] @ q[2:] - 4
+        return jnp.stack([q[:2] @ q[:2] - 1, other @ other - length, third, 3 * third])
+
+    system = ej.System(jnp.eye(4), lambda q, foot: G * (q[1] + q[3]), rods, redundant=True)
+    start = ej.initial_state(system, [0.6, 0.8, 2.0, 0.0], jnp.zeros(4), 0.0)
+    run = lambda foot: ej.simulate(
+        system, ej.EnergyPreserving(), start, foot, h=1e-3, num_steps=100, throw=False
+    )
+    assert run(0.0).result == ej.RESULTS.successful
+    assert run(1e-12).result != ej.RESULTS.successful
 
 
 @pytest.mark.slow

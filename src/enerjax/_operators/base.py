@@ -469,18 +469,23 @@ class AbstractModel(eqx.Module):
         return jnp.full((count,), -(float(jnp.finfo(dtype).eps) ** 0.5), dtype)
 
     @property
+    def num_joints(self) -> int:
+        """The number of constraints that do not relate redundant coordinates."""
+        scales = self.scales
+        relations = jax.eval_shape(self.coordinate, scales.coordinate).size
+        return scales.constraint.size - relations
+
+    @property
     def delassus_regularisation(self) -> JointMultipliers | None:
         """What is added to the diagonal of the Delassus matrix; `None` for a system whose
         constraints are declared to be independent.
 
-        It is a small part of the diagonal. The multipliers have the same norm as with
-        `regularisation`.
+        At the start it is a small part of the diagonal. The multipliers have the same norm
+        as with `regularisation`.
         """
         if not self.system.redundant:
             return None
-        scales = self.scales
-        relations = jax.eval_shape(self.coordinate, scales.coordinate).size
-        joints = scales.constraint[: scales.constraint.size - relations]
+        joints = self.scales.constraint[: self.num_joints]
         eps = float(jnp.finfo(joints.dtype).eps)
         return eps**_REGULARISATION * joints**2
 
@@ -581,8 +586,8 @@ def row_scales(
 
 # The evaluation of a term takes a few operations, each with a rounding error.
 _OPERATIONS_PER_TERM = 4.0
-# The power of the machine epsilon by which the Delassus matrix is regularised. The square
-# of the number must be far above round-off, and it must be far below the eigenvalues.
+# The power of the machine epsilon by which the Delassus matrix is regularised. The number
+# must be far below the eigenvalues, and round-off is divided by its square.
 _REGULARISATION = 0.375
 # The number of changes of the inputs from which the size of a term is estimated.
 _DRAWS = 3

@@ -505,8 +505,17 @@ class SeparableModel(AbstractModel):
         free_rate = self._free_joint_acceleration(state, qdot)
         unit = 1 / self.kinematics.velocity_scale(self.inertia)
 
+        # The multipliers of the relations come first: what is added to the diagonal pairs
+        # each multiplier of a joint with the row of this joint.
+        count, num_joints = scales.constraint.size, self.num_joints
+        first = v.size + count - num_joints
+
+        def parts(x: Array) -> tuple[Velocities, Multipliers]:
+            multipliers = jnp.concatenate([x[first:], x[v.size : first]])
+            return unit * x[: v.size], multipliers / scales.constraint
+
         def conditions(x: Array) -> Array:
-            acceleration, multipliers = unit * x[: v.size], x[v.size :] / scales.constraint
+            acceleration, multipliers = parts(x)
             # Evaluated in this function, because the sparsity pattern is found from index
             # arrays that are constants of the traced function.
             pulled = self._momentum_rows(q, self.inertia @ acceleration)
@@ -519,10 +528,9 @@ class SeparableModel(AbstractModel):
             )
             return jnp.concatenate(rows)
 
-        count = scales.constraint.size
         like = jnp.zeros((v.size + count,), q.dtype)
-        x = affine_root(conditions, like, self.regularisation_after(v, count))
-        return unit * x[: v.size], x[v.size :] / scales.constraint
+        added = self.regularisation_after(like[:first], num_joints)
+        return parts(affine_root(conditions, like, added))
 
     def multipliers(self, state: State) -> Multipliers:
         """With `L = I` the multipliers are found from the smaller matrix `B M^-1 B^T`."""

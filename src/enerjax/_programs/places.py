@@ -14,6 +14,7 @@ def at_places(x: Array, places: Int[np.ndarray, "*places"]) -> Array:
     negative indices at every call.
     """
     flat = places.ravel()
+    assert np.all((flat >= 0) & (flat < x.shape[0]))
     shape = *places.shape, *x.shape[1:]
     if flat.size == 0:
         return x[:0].reshape(shape)

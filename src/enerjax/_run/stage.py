@@ -7,7 +7,7 @@ extrapolation of the differences between the last steps and their free flights.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -137,14 +137,11 @@ def solve(
     apart = part if has_parts else lambda fn: fn
     prepare = simplified(lambda: _prepared(scheme, problem, model, start, h, memory))
     prepared = apart(prepare)()
-    unknown_scale, row_scale = prepared.unknown_scale, prepared.row_scale
-    # Multiplications take less time than divisions, and there is one for each residual.
-    reciprocals = prepared.reciprocals
 
     def scaled(x, inputs):
-        scheme, problem, scales, (_, per_row) = inputs
-        z = jax.tree.map(jnp.multiply, x, scales[0])
-        return jax.tree.map(jnp.multiply, scheme.residual(z, problem), per_row)
+        scheme, problem, scales = inputs
+        z = jax.tree.map(jnp.multiply, x, scales.unknown)
+        return jax.tree.map(jnp.multiply, scheme.residual(z, problem), scales.per_row)
 
     wait = memory.chord_wait
     alone = is_chord_alone(root_finder, scheme, model, memory)
@@ -152,12 +149,12 @@ def solve(
         scaled,
         root_finder,
         prepared.guess,
-        (scheme, problem, (unknown_scale, row_scale), reciprocals),
+        (scheme, problem, prepared.scales),
         max_iterations=MAX_ITERATIONS,
         others=prepared.others,
         factors=None if alone else prepared.factors,
         skip=skip,
-        regularisation=_regularisation(model, unknown_scale, row_scale),
+        regularisation=_regularisation(model, prepared.scales),
         least=prepared.least,
         chord=_chord(scheme) if alone or wait is not None else None,
         by_chord=True if wait is None else wait == 0,
@@ -208,16 +205,23 @@ def unsolved(
     )
 
 
-class _Prepared(eqx.Module):
-    """The data of a search: scales, guesses and factors. `flight` is a free flight.
+class _Scales(NamedTuple):
+    """The scales of unknowns and rows, and their reciprocals.
 
-    `reciprocals` are those of the scales of unknowns and rows.
+    Each residual is multiplied by these, which takes less time than divisions.
     """
 
+    unknown: PyTree[Any]
+    row: PyTree[Any]
+    per_unknown: PyTree[Any]
+    per_row: PyTree[Any]
+
+
+class _Prepared(eqx.Module):
+    """The data of a search: scales, guesses and factors. `flight` is a free flight."""
+
     flight: PyTree[Any]
-    unknown_scale: PyTree[Any]
-    row_scale: PyTree[Any]
-    reciprocals: tuple[PyTree[Any], PyTree[Any]]
+    scales: _Scales
     least: Scalar
     guess: PyTree[Any]
     others: tuple[PyTree[Any], ...]
@@ -233,15 +237,13 @@ def _prepared(
     memory: Memory,
 ) -> _Prepared:
     flight = free_flight(scheme, problem, model, start)
-    unknown_scale, row_scale, least = scales_like(flight, model, start, h)
+    unknown, row, least = scales_like(flight, model, start, h)
     inverse = lambda scale: jax.tree.map(jnp.reciprocal, scale)
-    per_unknown = inverse(unknown_scale)
-    scaled = lambda z: jax.tree.map(jnp.multiply, z, per_unknown)
+    scales = _Scales(unknown, row, inverse(unknown), inverse(row))
+    scaled = lambda z: jax.tree.map(jnp.multiply, z, scales.per_unknown)
     return _Prepared(
         flight=flight,
-        unknown_scale=unknown_scale,
-        row_scale=row_scale,
-        reciprocals=(per_unknown, inverse(row_scale)),
+        scales=scales,
         least=least,
         guess=scaled(jax.tree.map(jnp.add, flight, predicted(memory))),
         # The extrapolated guess can lie beyond a fold of the step equations. A free flight
@@ -262,7 +264,8 @@ def _solved(
     root_finder: RootFinder | ChordAlone,
 ) -> Solved:
     """The result of a step whose search has ended with `root`."""
-    z = jax.tree.map(jnp.multiply, root.value, prepared.unknown_scale)
+    unknown_scale = prepared.scales.unknown
+    z = jax.tree.map(jnp.multiply, root.value, unknown_scale)
     end = scheme.finish(z, problem)
     tests = lambda: _gradients_reverse(model, start, end.state)
     no = jnp.array(False)
@@ -276,14 +279,14 @@ def _solved(
     branch = RESULTS.where(reverses, RESULTS.step_too_large, RESULTS.successful)
     found = from_root_finder(root.found, root.broken, root.finite)
     added = jax.lax.stop_gradient(jax.tree.map(jnp.subtract, z, prepared.flight))
-    sizes = model.scales.step, added, memory.added, prepared.unknown_scale
+    sizes = model.scales.step, added, memory.added, unknown_scale
     return Solved(
         end=end,
         iterations=root.iterations,
         residual=root.residual,
         result=first_failure(first_failure(end.result, found), branch),
         roughness=roughness(*sizes),
-        memory=memory_after(memory, added, prepared.unknown_scale, root, end.carried),
+        memory=memory_after(memory, added, unknown_scale, root, end.carried),
     )
 
 
@@ -292,23 +295,23 @@ def _chord(scheme: AbstractOneSolveScheme) -> Chord:
     assert isinstance(scheme, AbstractSchemeWithChord)
 
     def prepare(x, inputs):
-        scheme, problem, (unknown_scale, _), _ = inputs
-        z = jax.tree.map(jnp.multiply, x, unknown_scale)
+        scheme, problem, scales = inputs
+        z = jax.tree.map(jnp.multiply, x, scales.unknown)
         return scheme.delassus_matrix(z, problem)
 
     def correct(value, inputs, matrix):
-        scheme, problem, (_, row_scale), (per_unknown, _) = inputs
-        rows = jax.tree.map(jnp.multiply, value, row_scale)
+        scheme, problem, scales = inputs
+        rows = jax.tree.map(jnp.multiply, value, scales.row)
         correction = scheme.chord(rows, problem, matrix)
-        return jax.tree.map(jnp.multiply, correction, per_unknown)
+        return jax.tree.map(jnp.multiply, correction, scales.per_unknown)
 
     def effective(x, inputs, matrix):
         if matrix.regularisation is None:
             return x
-        _, _, (unknown_scale, _), (per_unknown, _) = inputs
+        _, _, scales = inputs
         new = lambda z: tuple(map(matrix.effective, _multipliers(z)))
-        z = _with_multipliers(jax.tree.map(jnp.multiply, x, unknown_scale), new)
-        return jax.tree.map(jnp.multiply, z, per_unknown)
+        z = _with_multipliers(jax.tree.map(jnp.multiply, x, scales.unknown), new)
+        return jax.tree.map(jnp.multiply, z, scales.per_unknown)
 
     return Chord(prepare, correct, effective)
 
@@ -353,7 +356,7 @@ def _multipliers(x: Increment) -> tuple[Multipliers, JointMultipliers]:
     return x.impulse, x.velocity_impulse
 
 
-def _regularisation(model: AbstractModel, unknown_scale: Any, row_scale: Any) -> Any | None:
+def _regularisation(model: AbstractModel, scales: _Scales) -> Any | None:
     """The regularisation of the step equations of systems with redundant constraints.
 
     It is weighted by the scales of rows and unknowns, so that the multipliers have the
@@ -362,13 +365,15 @@ def _regularisation(model: AbstractModel, unknown_scale: Any, row_scale: Any) ->
     if not model.system.redundant:
         return None
 
+    # Joints alone can be redundant: relations between coordinates are independent.
     def weighted(unit: Array, row: Array) -> Array:
-        product = unit * row
+        product = (unit * row)[: model.num_joints]
         share = jnp.min(product, initial=jnp.inf) / product
-        return share * jnp.asarray(model.regularisation(unit.size, unit.dtype))
+        added = share * jnp.asarray(model.regularisation(product.size, unit.dtype))
+        return jnp.pad(added, (0, unit.size - added.size))
 
-    none = jax.tree.map(jnp.zeros_like, unknown_scale)
-    weights = jax.tree.map(weighted, unknown_scale, row_scale)
+    none = jax.tree.map(jnp.zeros_like, scales.unknown)
+    weights = jax.tree.map(weighted, scales.unknown, scales.row)
     return _with_multipliers(none, lambda _, of: _multipliers(of), weights)
 
 

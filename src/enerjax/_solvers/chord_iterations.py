@@ -61,8 +61,11 @@ def chord_iterations(
     start: Start,
     guess: Vector,
     patience: int,
+    is_regular: bool = True,
 ) -> _Chord:
     """Searches a root of `value` with at most `patience` corrections `solve(value(x))`.
+
+    `is_regular`: whether corrections show every part of a residual.
 
     Convergence is measured mainly by the residual. Corrections alone would be misleading:
     the multipliers of the velocity-level constraints are small and poorly determined,
@@ -92,7 +95,8 @@ def chord_iterations(
         # So is a larger one, if corrections have reduced it and two in a row no longer do:
         # the inertia of an arm is ill-conditioned, and its rates have few exact digits.
         is_floor = stalls & before.has_shrunk & (defect <= powers.tiny)
-        done = done | (is_floor & (size <= powers.small))
+        if is_regular:
+            done = done | (is_floor & (size <= powers.small))
         done = done & jnp.isfinite(size)
         late = before.corrections + 1 >= patience
         return _Chord(

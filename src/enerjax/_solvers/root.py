@@ -164,8 +164,9 @@ def find_root(
     A `regularisation` is needed where the equations do not determine all unknowns. It is a
     set of small numbers that are added to the diagonal of the Jacobian and make it regular.
     The result is then the root of least norm, weighted by `regularisation`, with its
-    derivatives. Unknowns that are all smaller than one are resolved relative to the largest
-    of them, but to no less than `least`.
+    derivatives; the chord method finds the one that `chord.effective` chooses. Unknowns
+    that are all smaller than one are resolved relative to the largest of them, but to no
+    less than `least`.
 
     With a `chord`, and if `by_chord` is true, `Newton` first tries the chord method, and
     uses the exact Jacobian only where that fails; `ChordAlone` finds no root there. The

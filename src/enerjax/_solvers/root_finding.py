@@ -169,13 +169,13 @@ def _by_chord(
     start: Start,
     patience: int,
 ) -> Root:
-    _, unravel = ravel_pytree(start.guess)
-
     def begin() -> tuple[PyTree, Array]:
         prepared = chord.prepare(start.guess, args)
         return prepared, ravel_pytree(chord.effective(start.guess, args, prepared))[0]
 
+    given, unravel = ravel_pytree(start.guess)
     prepared, guess = part(begin)()
+    guess = jnp.where(start.skip, given, guess)
     leaves_of = lambda tree: tuple(jax.tree.leaves(tree))
     joined = lambda leaves: jnp.concatenate([x.ravel() for x in leaves])
 
@@ -188,7 +188,12 @@ def _by_chord(
         correct = lambda x: leaves_of(chord.correct(unravel(x), args, prepared))
         return joined(unmerged(correct)(right))
 
-    search = lambda: chord_iterations(value, solve, newton, start, guess, patience)
+    # Corrections have no part outside of the range of singular equations, so that rows that
+    # contradict each other would pass for round-off.
+    is_regular = start.regularisation is None
+    search = lambda: chord_iterations(
+        value, solve, newton, start, guess, patience, is_regular
+    )
     last = part(search)()
     return Root(
         value=unravel(last.x),

@@ -70,9 +70,9 @@ class System(AbstractSystem):
       rotation. The audit then reports the momenta that belong to these motions; nothing
       else changes.
     - `redundant`: whether constraints may be redundant, as in over-constrained mechanisms.
-      Multipliers and their derivatives are then those of least norm (each in the measure
-      of its constraint), up to terms of order `h`; the motion and its derivatives do not
-      depend on this choice.
+      Multipliers of the joints and their derivatives are then those of least norm (each in
+      the measure of its constraint), up to terms of order `h`; the motion and its
+      derivatives do not depend on this choice.
     - `rigid_bodies`: the indices of the coordinates of each rigid body in space, shape
       `(bodies, 12)`: its mass centre, then its three body axes as vectors in space (the
       directors). Leave it out if there is none. The library keeps the axes orthonormal, so

@@ -25,7 +25,7 @@ class Places(Indices):
 
     - `rows`: the rows of each block, shape `(blocks, size)`; the number of rows at padded
       positions, where a block is smaller than the largest one. `read`: the same with any
-      row at padded positions.
+      row at padded positions, whose values are not used.
     - `padding`: ones on the diagonal at padded positions.
     - `back`: the position of each row in the blocks, and `within`: in its own block.
     """

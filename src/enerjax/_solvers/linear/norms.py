@@ -6,8 +6,8 @@ from jaxtyping import Array
 from ..._types import Scalar
 
 
-# The most rows of numbers of which `largest` compares corresponding ones first.
-_ROWS = 16
+# The number of pieces of an array that are compared entry by entry first.
+_PIECES = 16
 
 
 def largest(x: Array) -> Scalar:
@@ -18,9 +18,9 @@ def largest(x: Array) -> Scalar:
     """
     sizes = jnp.abs(x.ravel())
     sizes = jnp.where(jnp.isnan(sizes), jnp.inf, sizes)
-    # XLA's reductions of numbers of one row do not use vectors.
-    width = -(-sizes.size // _ROWS)
+    # XLA does not vectorise a reduction to a single number.
+    width = -(-sizes.size // _PIECES)
     if width > 1:
-        rows = jnp.pad(sizes, (0, -sizes.size % width)).reshape(-1, width)
-        sizes = functools.reduce(jnp.maximum, rows)
+        pieces = jnp.pad(sizes, (0, -sizes.size % width)).reshape(-1, width)
+        sizes = functools.reduce(jnp.maximum, pieces)
     return jnp.max(sizes, initial=0.0)
