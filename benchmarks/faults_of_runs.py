@@ -328,6 +328,22 @@ FAULTS = (
         of("end_time::test_rows_within_steps_without_constraints"),
     ),
     Fault(
+        "chord: contradictory rows",
+        "_solvers/root_finding.py",
+        "    is_regular = start.regularisation is None\n",
+        "    is_regular = True\n",
+        "Rows that contradict each other by little pass for round-off.",
+        of("redundant::test_rods_that_contradict_each_other_are_not_followed"),
+    ),
+    Fault(
+        "chord: a null space that is divided by a small number",
+        "_operators/delassus.py",
+        "found - self.schur.solve(self.regularisation[None] * found)",
+        "found",
+        "Multipliers of redundant rows grow by round-off over what is added.",
+        of("chord::test_the_matrix_of_redundant_rows_is_that_of_the_pseudo_inverse"),
+    ),
+    Fault(
         "audit: the largest leak",
         "_run/audit.py",
         '("  unaccounted for (largest row)", largest(audit.leak))',

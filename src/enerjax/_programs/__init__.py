@@ -35,7 +35,7 @@ from .one_function.api import (
 from .one_function.obstacles import why_not_one_function as why_not_one_function
 from .one_function.possible import LARGEST_SUM as LARGEST_SUM
 from .one_function.products import plain_products as plain_products, summed as summed
-from .places import at_places as at_places
+from .places import at_places as at_places, with_any as with_any
 from .simplification import simplified as simplified
 from .sparsity.jacobian_columns import (
     batched_columns as batched_columns,

@@ -25,3 +25,15 @@ def at_places(x: Array, places: Int[np.ndarray, "*places"]) -> Array:
         return taken.reshape(shape)
     found = jnp.asarray(x).at[places.astype(np.int32)]
     return found.get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+def with_any(places: Int[np.ndarray, "*places"], count: int) -> Int[np.ndarray, "*places"]:
+    """Places of which those one past the end, `count`, are replaced by any others.
+
+    They are spread evenly: the transpose of a gather takes as long as the place that is
+    read most often.
+    """
+    absent = places == count
+    out = np.array(places)
+    out[absent] = np.arange(np.count_nonzero(absent)) % count
+    return out

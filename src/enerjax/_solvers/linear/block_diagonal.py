@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from ..._programs import at_places, Indices, is_known, jacobian_pattern, summed
+from ..._programs import at_places, Indices, is_known, jacobian_pattern, summed, with_any
 from ..._types import Flag
 
 
@@ -38,7 +38,7 @@ class Places(Indices):
         within = np.arange(size) - starts[labels[order]]
         self.rows = np.full((sizes.size, sizes.max()), size)
         self.rows[labels[order], within] = order
-        self.read = np.minimum(self.rows, size - 1)
+        self.read = with_any(self.rows, size)
         self.padding = (self.rows == size)[:, :, None] * np.eye(sizes.max())
         self.back = np.zeros(size, int)
         self.back[order] = labels[order] * sizes.max() + within

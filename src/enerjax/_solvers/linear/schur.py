@@ -20,7 +20,15 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from ..._programs import at_places, Indices, jacobian_pattern, shape_of, summed, unmerged
+from ..._programs import (
+    at_places,
+    Indices,
+    jacobian_pattern,
+    shape_of,
+    summed,
+    unmerged,
+    with_any,
+)
 from .block_diagonal import BlockDiagonal, Symmetric
 from .block_tridiagonal import block_sizes, coloured_products, column_colours
 
@@ -76,7 +84,7 @@ class SchurTables(Indices):
         )
         none = np.full((1, blocks.shape[1]), size)
         self.columns = np.concatenate([blocks, none])[self.touched]
-        self.read = np.minimum(self.columns, size - 1)
+        self.read = with_any(self.columns, size)
         self._find_entries(rows, columns, size)
         self._cut(incidence)
 
@@ -102,7 +110,7 @@ class SchurTables(Indices):
         self.transposed = np.full((size, counts.max(initial=1)), known.size)
         self.transposed[columns[order], within] = places[order]
         per_row = known.size // self.num_rows
-        self.rows_of_column = np.minimum(self.transposed // per_row, self.num_rows - 1)
+        self.rows_of_column = with_any(self.transposed // per_row, self.num_rows)
 
     def _cut(self, incidence: "scipy.sparse.csr_array") -> None:
         coupling = scipy.sparse.csr_array(incidence @ incidence.T)
@@ -115,7 +123,7 @@ class SchurTables(Indices):
         self.back[order] = number * self.width + within
         order = np.full(sizes.size * self.width, self.num_rows)
         order[self.back] = np.arange(self.num_rows)
-        self.order = np.minimum(order, self.num_rows - 1)
+        self.order = with_any(order, self.num_rows)
         along = order.reshape(self.num_blocks, self.width)
         self.padding = (along == self.num_rows)[:, :, None] * np.eye(self.width)
         self.diagonal = self._shared([(rows, rows) for rows in along])
