@@ -329,9 +329,9 @@ FAULTS = (
     ),
     Fault(
         "chord: contradictory rows",
-        "_solvers/root_finding.py",
-        "    is_regular = start.regularisation is None\n",
-        "    is_regular = True\n",
+        "_solvers/chord_iterations.py",
+        "if start.regularisation is None:",
+        "if True:",
         "Rows that contradict each other by little pass for round-off.",
         of("redundant::test_rods_that_contradict_each_other_are_not_followed"),
     ),

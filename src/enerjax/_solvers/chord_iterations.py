@@ -61,11 +61,8 @@ def chord_iterations(
     start: Start,
     guess: Vector,
     patience: int,
-    is_regular: bool = True,
 ) -> _Chord:
     """Searches a root of `value` with at most `patience` corrections `solve(value(x))`.
-
-    `is_regular`: whether corrections show every part of a residual.
 
     Convergence is measured mainly by the residual. Corrections alone would be misleading:
     the multipliers of the velocity-level constraints are small and poorly determined,
@@ -95,7 +92,9 @@ def chord_iterations(
         # So is a larger one, if corrections have reduced it and two in a row no longer do:
         # the inertia of an arm is ill-conditioned, and its rates have few exact digits.
         is_floor = stalls & before.has_shrunk & (defect <= powers.tiny)
-        if is_regular:
+        # The corrections of singular equations do not show rows that contradict each other,
+        # so a small correction proves nothing there.
+        if start.regularisation is None:
             done = done | (is_floor & (size <= powers.small))
         done = done & jnp.isfinite(size)
         late = before.corrections + 1 >= patience

@@ -188,12 +188,7 @@ def _by_chord(
         correct = lambda x: leaves_of(chord.correct(unravel(x), args, prepared))
         return joined(unmerged(correct)(right))
 
-    # Corrections have no part outside of the range of singular equations, so that rows that
-    # contradict each other would pass for round-off.
-    is_regular = start.regularisation is None
-    search = lambda: chord_iterations(
-        value, solve, newton, start, guess, patience, is_regular
-    )
+    search = lambda: chord_iterations(value, solve, newton, start, guess, patience)
     last = part(search)()
     return Root(
         value=unravel(last.x),

@@ -53,8 +53,7 @@ class SchurTables(Indices):
     - `columns`: the unknowns of each segment, shape `(rows, segments, size)`; `read`: the
       same with any unknown for absent ones.
     - `entries`: the index of each entry of the segments in the coloured products.
-    - `transposed`: the indices of the entries of each column of `B` in the segments, and
-      `rows_of_column`: their rows, or any row for absent ones.
+    - `transposed`: the indices of the entries of each column of `B` in the segments.
     - `diagonal`, `below`: for each block of `G`, on and below the diagonal, the indices in
       the segments of the entries that it is computed from; see `_shared`.
     - `order`: the row of `G` at each position of its blocks, or any row beyond the end of
@@ -109,8 +108,6 @@ class SchurTables(Indices):
         within = np.arange(order.size) - np.repeat(np.cumsum(counts) - counts, counts)
         self.transposed = np.full((size, counts.max(initial=1)), known.size)
         self.transposed[columns[order], within] = places[order]
-        per_row = known.size // self.num_rows
-        self.rows_of_column = with_any(self.transposed // per_row, self.num_rows)
 
     def _cut(self, incidence: "scipy.sparse.csr_array") -> None:
         coupling = scipy.sparse.csr_array(incidence @ incidence.T)
@@ -154,15 +151,13 @@ class SchurTables(Indices):
 class Schur(eqx.Module):
     """`B`, and the block factorisation of `G = B W B^T`.
 
-    - `rows`: the segments of the rows of `B`; see `SchurTables`. `columns`: the entries of
-      its columns, which are zero where they are absent.
+    - `rows`: the segments of the rows of `B`; see `SchurTables`.
     - `factors`: the blocks below the diagonal of the unit lower triangular factor.
     - `inverses`: the inverses of the diagonal blocks.
     """
 
     tables: SchurTables = eqx.field(static=True)
     rows: Float[Array, "rows segments size"]
-    columns: Float[Array, "n entries"]
     factors: Float[Array, "below width width"]
     inverses: Float[Array, "blocks width width"]
 
@@ -172,7 +167,8 @@ class Schur(eqx.Module):
 
     def transposed(self, x: Float[Array, " rows"]) -> Float[Array, " n"]:
         """`B^T x`"""
-        return summed(self.columns * at_places(x, self.tables.rows_of_column))
+        entries = jnp.append((self.rows * x[:, None, None]).ravel(), 0)
+        return summed(at_places(entries, self.tables.transposed))
 
     def solve(self, right: Float[Array, "k rows"]) -> Float[Array, "k rows"]:
         """`G^-1` times each of `k` vectors."""
@@ -250,10 +246,9 @@ def schur(
     if regularisation is not None:
         added = at_places(regularisation, tables.order).reshape(-1, tables.width, 1)
         diagonal = diagonal + added * jnp.eye(tables.width, dtype=added.dtype)[None]
-    columns = at_places(jnp.append(rows.ravel(), 0), tables.transposed)
     if tables.num_blocks == 1:
         none = jnp.zeros((0, tables.width, tables.width), at.dtype)
-        return Schur(tables, rows, columns, none, _inverse(diagonal[0])[None])
+        return Schur(tables, rows, none, _inverse(diagonal[0])[None])
 
     def eliminate(before, item):
         own, below = item
@@ -264,7 +259,7 @@ def schur(
     first = _inverse(diagonal[0])
     _, (factors, inverses) = jax.lax.scan(eliminate, first, (diagonal[1:], below))
     inverses = jnp.concatenate([first[None], inverses])
-    return Schur(tables, rows, columns, factors, inverses)
+    return Schur(tables, rows, factors, inverses)
 
 
 def _weighted(
