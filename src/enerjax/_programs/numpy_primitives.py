@@ -134,7 +134,7 @@ def _select(which, *cases, **_):
     return [np.choose(which.astype(int), cases)]
 
 
-_FUNCTIONS: dict[str, Callable] = {
+FUNCTIONS: dict[str, Callable] = {
     "abs": np.abs,
     "add": np.add,
     "and": np.bitwise_and,
@@ -175,8 +175,8 @@ def evaluated(primitive: Any, values: list[Any], params: dict[str, Any]) -> list
         return _select(*map(np.asarray, values))
     if name == "convert_element_type":
         return [np.asarray(values[0]).astype(params["new_dtype"])]
-    if name in _FUNCTIONS:
-        return [np.asarray(_FUNCTIONS[name](*map(np.asarray, values)))]
+    if name in FUNCTIONS:
+        return [np.asarray(FUNCTIONS[name](*map(np.asarray, values)))]
     if name in JIT:
         program, consts = params["jaxpr"].jaxpr, params["jaxpr"].consts
         return interpret(

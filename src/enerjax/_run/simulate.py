@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import jax
 
-from .._programs import at_top_level, compiled, is_known, values_of
+from .._programs import at_top_level, compiled, in_one_function, is_known, values_of
 from .._progress import Progress
 from .._results import may_need_newton, RESULTS
 from .._solvers import Newton, RootFinder
@@ -205,6 +205,18 @@ def _whole(task: Task, num_rows: int) -> tuple[Solution, _Outcome]:
 @compiled
 def _run(task: Task) -> tuple[Solution, _Outcome, bool]:
     """The program of a run in one piece; also whether it leaves out the exact Jacobian."""
+    alone: list[bool] = []
+
+    def run() -> tuple[Solution, _Outcome]:
+        solution, outcome, is_alone = _computed(task)
+        alone.append(is_alone)
+        return solution, outcome
+
+    solution, outcome = in_one_function(run)()
+    return solution, outcome, alone[0]
+
+
+def _computed(task: Task) -> tuple[Solution, _Outcome, bool]:
     plan, saving, stepper = task.plan, task.saving, task.stepper()
     model = stepper.model
     start = model.to_internal(task.start)

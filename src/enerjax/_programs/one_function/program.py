@@ -65,34 +65,30 @@ class Program:
         self.is_part = is_part
         self.known = known
         self.linear = linear
-        # The program that is run, which is rewritten if need be (derivatives are taken of
-        # `jaxpr`), the constants that it takes first, and the inputs that it does not take.
-        self._executed, self._consts, self._fixed = None, [], [None] * len(known)
         # Evaluations outside of other programs share one compilation.
         self.compiled = jax.jit(lambda *numbers: self.run(numbers))
-        if num_equations(jaxpr) > longest(jaxpr):
-            return
-        if is_possible(jaxpr) and not has_parts(jaxpr):
-            self._executed = jaxpr
-        elif is_possible(jaxpr, assumed=REWRITTEN):
-            rewritten_program = rewritten(jaxpr, known)
-            if is_possible(rewritten_program.jaxpr):
-                self._executed = rewritten_program.jaxpr
-                self._consts, self._fixed = rewritten_program.consts, known
 
-    @property
-    def is_possible(self) -> bool:
-        """Whether the program can be one function."""
-        return self._executed is not None and any(x is None for x in self._fixed)
+    @functools.cached_property
+    def function(self) -> Any:
+        """The function of machine code, or the reason why there is none."""
+        from ..machine_code import compiled_function, Unsupported
+
+        try:
+            return compiled_function(self.jaxpr, self.known)
+        except Unsupported as reason:
+            return reason
 
     def run(self, numbers: Sequence[Array]) -> list[Array]:
         """The outputs, computed in one function where that is possible."""
-        if not self.is_possible:
+        from ..machine_code import Function
+
+        function = self.function
+        if not isinstance(function, Function):
             return self(numbers)
-        pairs = zip(numbers, self._fixed, strict=True)
-        taken = (x for x, fixed in pairs if fixed is None)
-        inputs = [*map(jnp.asarray, self._consts), *taken]
-        return marked(functools.partial(_values, self._executed), inputs)
+        pairs = zip(numbers, self.known, strict=True)
+        taken = [x for x, known in pairs if known is None]
+        like = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in self.jaxpr.outvars]
+        return jax.ffi.ffi_call(function.name, like)(*taken)
 
     def own(self, numbers: Any) -> Any:
         """The inputs of the program itself, of all inputs of the primitive."""
@@ -166,9 +162,13 @@ def run_closed(
         lanes = InLanes(other, inputs, computed, when)
         # They are passed on, and not kept: a program can outlive the trace of its inputs.
         more, lanes.numbers = lanes.numbers, []
-    program = Program(jaxpr, list(map(as_index, needed)), is_part, linear, lanes)
+    num_consts = sum(of_consts)
+    known = [
+        known_numbers(x) if k < num_consts else as_index(x) for k, x in enumerate(needed)
+    ]
+    program = Program(jaxpr, known, is_part, linear, lanes)
     needed = list(map(jnp.asarray, needed))
-    if any(computed) and (program.is_possible or lanes is not None):
+    if any(computed):
         out = ONE_FUNCTION.bind(*needed, *more, program=program)
     else:
         out = program(needed)

@@ -1,0 +1,125 @@
+"""Factors of matrices of any size, as loops over the columns.
+
+The forms for a few rows, without loops, are those of `small_matrices.py`.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ..._types import Count
+
+
+def _column(x: Array, k: Count) -> Array:
+    return jax.lax.dynamic_index_in_dim(x, k, axis=1, keepdims=False)
+
+
+def _row(x: Array, k: Count) -> Array:
+    return jax.lax.dynamic_index_in_dim(x, k, axis=0, keepdims=False)
+
+
+def _lu(
+    matrix: Float[Array, "m n"],
+) -> tuple[Float[Array, "m n"], Int[Array, " k"], Int[Array, " m"]]:
+    """The factors, the pivot of each column, and the order of the rows."""
+    num_rows, num_columns = matrix.shape
+    rows = jnp.arange(num_rows, dtype=jnp.int32)
+    columns = jnp.arange(num_columns, dtype=jnp.int32)
+
+    def turn(carry: tuple[Array, Array], k: Count) -> tuple[tuple[Array, Array], Count]:
+        matrix, order = carry
+        sizes = jnp.where(rows >= k, jnp.abs(_column(matrix, k)), -1.0)
+        pivot = jnp.argmax(sizes).astype(jnp.int32)
+        exchanged = jnp.where(rows == pivot, k, rows)
+        exchanged = jnp.where(rows == k, pivot, exchanged)
+        matrix, order = (
+            x.at[exchanged].get(mode="promise_in_bounds") for x in (matrix, order)
+        )
+        row, column = _row(matrix, k), _column(matrix, k)
+        divisor = row[k]
+        # A column of zeros is left as it is, as by LAPACK.
+        divisor = jnp.where(divisor == 0, 1, divisor)
+        factors = jnp.where(rows > k, column / divisor, 0)
+        rest = jnp.where(columns > k, row, 0)
+        matrix = matrix - factors[:, None] * rest[None]
+        is_below = (rows > k)[:, None] & (columns == k)[None]
+        return (jnp.where(is_below, factors[:, None], matrix), order), pivot
+
+    steps = jnp.arange(min(num_rows, num_columns), dtype=jnp.int32)
+    (matrix, order), pivots = jax.lax.scan(turn, (matrix, rows), steps)
+    return matrix, pivots, order
+
+
+def _cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """The lower factor, with zeros above the diagonal."""
+    rows = jnp.arange(matrix.shape[0])
+
+    def turn(matrix: Array, k: Count) -> tuple[Array, Array]:
+        column = _column(matrix, k)
+        column = jnp.where(rows >= k, column / jnp.sqrt(column[k]), 0)
+        return matrix - column[:, None] * column[None], column
+
+    _, columns = jax.lax.scan(turn, matrix, rows)
+    # As by LAPACK, nothing is left of the factor of a matrix that is not definite.
+    return jnp.where(jnp.isfinite(columns[-1, -1]), columns.T, jnp.nan)
+
+
+def _substituted(
+    matrix: Float[Array, "n n"], right: Float[Array, "n k"], is_unit: bool
+) -> Float[Array, "n k"]:
+    """The solution for a lower triangular matrix."""
+    rows = jnp.arange(matrix.shape[0])
+
+    def turn(right: Array, k: Count) -> tuple[Array, Array]:
+        column, row = _column(matrix, k), _row(right, k)
+        row = row if is_unit else row / column[k]
+        return right - jnp.where(rows > k, column, 0)[:, None] * row[None], row
+
+    return jax.lax.scan(turn, right, rows)[1]
+
+
+def _triangular_solve(
+    matrix: Float[Array, "n n"],
+    right: Array,
+    *,
+    left_side: bool,
+    lower: bool,
+    transpose_a: bool,
+    unit_diagonal: bool,
+) -> Array:
+    if not left_side:
+        matrix, lower, right = matrix.T, not lower, right.T
+    if transpose_a:
+        matrix, lower = matrix.T, not lower
+    if lower:
+        out = _substituted(matrix, right, unit_diagonal)
+    else:
+        out = _substituted(matrix[::-1, ::-1], right[::-1], unit_diagonal)[::-1]
+    return out if left_side else out.T
+
+
+def _of_each(fn: Callable, num_axes: int, *values: Array) -> Any:
+    """`fn` of the last axes of arrays, for all entries of the others."""
+    for _ in values[0].shape[: values[0].ndim - num_axes]:
+        fn = jax.vmap(fn)
+    return fn(*values)
+
+
+def factors_by_loops(
+    name: str, values: list[Array], params: dict[str, Any]
+) -> list[Array]:
+    """The outputs of `lu`, `cholesky` or `triangular_solve`."""
+    if name == "cholesky":
+        return [_of_each(_cholesky, 2, *values)]
+    if name == "lu":
+        return list(_of_each(_lu, 2, *values))
+    keys = "left_side lower transpose_a unit_diagonal".split()
+    how = {key: params[key] for key in keys}
+    return [_of_each(functools.partial(_triangular_solve, **how), 2, *values)]
+
+
+BY_LOOPS = frozenset("cholesky lu triangular_solve".split())

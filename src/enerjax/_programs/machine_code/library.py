@@ -1,0 +1,270 @@
+"""Code for LLVM, compiled for this machine, as a function that XLA calls."""
+
+import ctypes
+import functools
+import hashlib
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from .emission import Emission
+from .evaluation import Evaluation
+from .values import Block, dtype_of, Memory, type_name, Value
+
+
+_CODES = {"f8": "double", "f4": "float", "b1": "i8"} | {
+    f"{kind}{n}": f"i{8 * n}" for kind in "iu" for n in (1, 2, 4, 8)
+}
+
+
+class Function:
+    """A program as a function of machine code.
+
+    - `name`: the name under which XLA calls it.
+    - `length`: the number of its operations.
+    """
+
+    def __init__(self, name: str, length: int):
+        self.name, self.length = name, length
+
+
+def compiled_function(
+    jaxpr: Any, known: Sequence[np.ndarray | None]
+) -> Function:
+    """The function of a program, of the inputs whose values are not known.
+
+    Raises `Unsupported`.
+    """
+    evaluation = Evaluation()
+    cellar = evaluation.cellar
+    variables = [*jaxpr.constvars, *jaxpr.invars]
+    values: list[Value] = []
+    inputs: list[tuple[str, int, int]] = []
+    owner = Block(evaluation.graph.root, 0)
+    for variable, value in zip(variables, known, strict=True):
+        aval = variable.aval
+        if value is not None:
+            values.append(np.asarray(value, aval.dtype))
+            continue
+        dtype = type_name(aval.dtype)
+        first = cellar.new(aval.size, owner)
+        inputs.append((dtype, first, aval.size))
+        values.append(
+            Memory(dtype, (first + np.arange(aval.size)).reshape(aval.shape))
+            if aval.size
+            else np.zeros(aval.shape, aval.dtype)
+        )
+    count = len(jaxpr.constvars)
+    outs = evaluation.outputs(jaxpr, values[:count], values[count:])
+    outs = [
+        np.asarray(x, var.aval.dtype) if isinstance(x, np.ndarray) else x
+        for x, var in zip(outs, jaxpr.outvars, strict=True)
+    ]
+    outputs = [
+        (dtype_of(x), cellar.memory(x).places.ravel() if np.prod(x.shape) else None)
+        for x in outs
+    ]
+    return _function(Emission(cellar), inputs, outputs)
+
+
+def _function(emission: Emission, inputs: list, outputs: list) -> Function:
+    cellar = emission.cellar
+    main = emission.main()
+    copies = _copies(emission, inputs, outputs)
+    constants = np.concatenate([np.zeros(0, np.int64), *cellar.constants])
+    tables = [emission.addresses(x) for x in cellar.tables]
+    size = 8 * (cellar.num_constants + cellar.size)
+    handler = _HANDLER.replace("$SIZE$", str(max(size, 8)))
+    handler = handler.replace("$CONSTANTS$", str(8 * constants.size))
+    handler = handler.replace("$COPIES_IN$", copies[0]).replace("$COPIES_OUT$", copies[1])
+    text = "\n".join([
+        *sorted(emission.declared),
+        *emission.functions,
+        main,
+        _helpers(),
+        handler,
+        'attributes #0 = { nounwind noinline "no-trapping-math"="true" }',
+        "attributes #1 = { nounwind willreturn memory(none) }",
+    ])
+    digest = hashlib.sha256(text.encode())
+    for x in (constants, *tables):
+        digest.update(x.tobytes())
+    name = f"enerjax_{digest.hexdigest()[:32]}"
+    _library().add(name, text, constants, tables)
+    return Function(name, emission.length)
+
+
+def _copies(emission: Emission, inputs: list, outputs: list) -> tuple[str, str]:
+    """The code that copies inputs to the memory, and outputs from it."""
+    before, after = [], []
+    for k, (dtype, first, count) in enumerate(inputs):
+        if count == 0:
+            continue
+        before += [
+            f"  %ia{k} = getelementptr ptr, ptr %args, i64 {k}",
+            f"  %ib{k} = load ptr, ptr %ia{k}",
+            f"  %ic{k} = getelementptr i8, ptr %ib{k}, i64 24",
+            f"  %id{k} = load ptr, ptr %ic{k}",
+            f"  %ie{k} = getelementptr double, ptr %m, i64 {emission.address(first)}",
+            f"  call void @in_{dtype}(ptr %id{k}, ptr %ie{k}, i64 {count})",
+        ]
+    for k, (dtype, places) in enumerate(outputs):
+        if places is None:
+            continue
+        after += [
+            f"  %oa{k} = getelementptr ptr, ptr %rets, i64 {k}",
+            f"  %ob{k} = load ptr, ptr %oa{k}",
+            f"  %oc{k} = getelementptr i8, ptr %ob{k}, i64 24",
+            f"  %od{k} = load ptr, ptr %oc{k}",
+        ]
+        addresses = emission.addresses(places)
+        if np.all(np.diff(addresses) == 1):
+            after += [
+                f"  %oe{k} = getelementptr double, ptr %m, i64 {addresses[0]}",
+                f"  call void @out_{dtype}(ptr %oe{k}, ptr %od{k}, i64 {places.size})",
+            ]
+        else:
+            table = emission.cellar.table(places)
+            after.append(
+                f"  call void @pick_{dtype}(ptr %m, ptr inttoptr (i64 $T{table}$ to ptr), "
+                f"ptr %od{k}, i64 {places.size})"
+            )
+    return "\n".join(before), "\n".join(after)
+
+
+_LOOP = """define internal void @{name}({args}, i64 %n) #0 {{
+entry:
+  br label %loop
+loop:
+  %k = phi i64 [ 0, %entry ], [ %next, %loop ]
+{body}
+  %next = add i64 %k, 1
+  %more = icmp ult i64 %next, %n
+  br i1 %more, label %loop, label %end
+end:
+  ret void
+}}
+"""
+
+
+@functools.cache
+def _helpers() -> str:
+    """Functions that copy arrays of each type to cells, and cells to arrays."""
+    out = []
+    for dtype, kind in _CODES.items():
+        cell = "double" if dtype[0] == "f" else "i64"
+        load = [f"  %a = getelementptr {kind}, ptr %x, i64 %k", f"  %v = load {kind}, ptr %a"]
+        widen, narrow = "  %w = ", "  %w = "
+        if kind == cell:
+            widen += f"bitcast {kind} %v to {cell}"
+            narrow += f"bitcast {cell} %v to {kind}"
+        elif dtype == "f4":
+            widen += "fpext float %v to double"
+            narrow += "fptrunc double %v to float"
+        else:
+            widen += f"{'sext' if dtype[0] == 'i' else 'zext'} {kind} %v to i64"
+            narrow += f"trunc i64 %v to {kind}"
+        store = lambda kind: [
+            f"  %b = getelementptr {kind}, ptr %y, i64 %k",
+            f"  store {kind} %w, ptr %b",
+        ]
+        two = "ptr %x, ptr %y"
+        body = "\n".join([*load, widen, *store(cell)])
+        out.append(_LOOP.format(name=f"in_{dtype}", args=two, body=body))
+        read = [f"  %a = getelementptr {cell}, ptr %x, i64 %k", f"  %v = load {cell}, ptr %a"]
+        body = "\n".join([*read, narrow, *store(kind)])
+        out.append(_LOOP.format(name=f"out_{dtype}", args=two, body=body))
+        find = [
+            "  %t = getelementptr i64, ptr %table, i64 %k",
+            "  %i = load i64, ptr %t",
+            f"  %a = getelementptr {cell}, ptr %x, i64 %i",
+            f"  %v = load {cell}, ptr %a",
+        ]
+        body = "\n".join([*find, narrow, *store(kind)])
+        three = "ptr %x, ptr %table, ptr %y"
+        out.append(_LOOP.format(name=f"pick_{dtype}", args=three, body=body))
+    return "\n".join(out)
+
+
+# The function that XLA calls, by the interface of `xla/ffi/api/c_api.h`: the offsets are
+# those of its structures. In a first call it is asked for the version of the interface, and
+# answers with the one that it is called by.
+_HANDLER = """
+declare ptr @malloc(i64)
+declare void @free(ptr)
+declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)
+define ptr @handler(ptr %frame) {
+entry:
+  %e0 = getelementptr i8, ptr %frame, i64 8
+  %e1 = load ptr, ptr %e0
+  %asks = icmp ne ptr %e1, null
+  br i1 %asks, label %answer, label %work
+answer:
+  %a0 = getelementptr i8, ptr %frame, i64 16
+  %api = load ptr, ptr %a0
+  %a1 = getelementptr i8, ptr %api, i64 32
+  %version = load i64, ptr %a1
+  %a2 = getelementptr i8, ptr %e1, i64 24
+  %metadata = load ptr, ptr %a2
+  %a3 = getelementptr i8, ptr %metadata, i64 24
+  store i64 %version, ptr %a3
+  ret ptr null
+work:
+  %m = call ptr @malloc(i64 $SIZE$)
+  call void @llvm.memcpy.p0.p0.i64(ptr %m, ptr inttoptr (i64 $C$ to ptr), i64 $CONSTANTS$, i1 false)
+  %f0 = getelementptr i8, ptr %frame, i64 72
+  %args = load ptr, ptr %f0
+  %f1 = getelementptr i8, ptr %frame, i64 112
+  %rets = load ptr, ptr %f1
+$COPIES_IN$
+  call void @main(ptr %m)
+$COPIES_OUT$
+  call void @free(ptr %m)
+  ret ptr null
+}
+"""
+
+
+class _Library:
+    """The compiled functions of this process, which stay for its life: XLA may call them."""
+
+    def __init__(self):
+        import llvmlite.binding as llvm
+
+        self._llvm = llvm
+        llvm.initialize_native_target()
+        llvm.initialize_native_asmprinter()
+        self._kept: dict[str, Any] = {}
+
+    def add(
+        self, name: str, text: str, constants: np.ndarray, tables: list[np.ndarray]
+    ) -> None:
+        if name in self._kept:
+            return
+        llvm = self._llvm
+        constants = np.ascontiguousarray(constants)
+        tables = [np.ascontiguousarray(x) for x in tables]
+        addresses = {f"T{k}": x.ctypes.data for k, x in enumerate(tables)}
+        addresses["C"] = constants.ctypes.data
+        text = re.sub(r"\$(\w+)\$", lambda found: str(addresses[found[1]]), text)
+        module = llvm.parse_assembly(text)
+        module.verify()
+        target = llvm.Target.from_default_triple().create_target_machine(
+            cpu=llvm.get_host_cpu_name(),
+            features=llvm.get_host_cpu_features().flatten(),
+            opt=int(__import__("os").environ.get("LOPT", "2")),
+        )
+        engine = llvm.create_mcjit_compiler(module, target)
+        engine.finalize_object()
+        address = engine.get_function_address("handler")
+        capsule = jax.ffi.pycapsule(ctypes.cast(address, ctypes.c_void_p))
+        jax.ffi.register_ffi_target(name, capsule, platform="cpu")
+        self._kept[name] = engine, constants, tables
+
+
+@functools.cache
+def _library() -> _Library:
+    return _Library()

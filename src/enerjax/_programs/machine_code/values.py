@@ -1,0 +1,344 @@
+"""Arrays of a program while it is compiled.
+
+An array whose numbers are known is a NumPy array. Any other is one of two kinds:
+
+- `Cells`: an array of numbers, each of them a node of the graph or known. One axis may be
+  that of the lanes; its entries are one node, of as many lanes.
+- `Memory`: an array of the cells of the memory where the numbers are. Moving entries, such
+  as slicing, transposing, or looking up at known places, moves cells while the program is
+  compiled and costs nothing when it runs.
+"""
+
+import bisect
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from .graph import as_number, Graph, Node, Number, number_type, Region
+
+
+# Arrays with fewer entries are not computed lane by lane, and neither are those whose
+# longest axis is shorter.
+_SMALL, _FEWEST_LANES = 24, 5
+# The most nodes of one array; larger arrays are computed as one axis of lanes.
+MOST_CELLS = 1_600
+# Cells from this number on hold constants.
+CONSTANTS = 1 << 40
+
+
+class Unsupported(Exception):
+    """A program that is not compiled here: the reason in words, and the operation."""
+
+
+class Cells:
+    def __init__(self, dtype: str, cells: np.ndarray, lane: int | None = None, n: int = 1):
+        self.dtype, self.cells, self.lane, self.n = dtype, cells, lane, n
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        shape = list(self.cells.shape)
+        if self.lane is not None:
+            shape[self.lane] = self.n
+        return tuple(shape)
+
+
+class Memory:
+    def __init__(self, dtype: str, places: np.ndarray):
+        self.dtype, self.places = dtype, places
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.places.shape
+
+
+Value: TypeAlias = np.ndarray | Cells | Memory
+
+
+def dtype_of(value: Any) -> str:
+    return value.dtype if isinstance(value, Cells | Memory) else type_name(value.dtype)
+
+
+def type_name(dtype: Any) -> str:
+    """The name of a type of numbers, such as `"f8"`."""
+    dtype = np.dtype(dtype)
+    name = dtype.str[1:]
+    if name not in _TYPES:
+        raise Unsupported(f"numbers of type {dtype}")
+    return name
+
+
+_TYPES = frozenset("f8 f4 i8 i4 i2 i1 u8 u4 u2 u1 b1".split())
+
+
+class Block:
+    """Cells that are written as a whole, by loops; they can be read from a level on."""
+
+    def __init__(self, region: Region, ready: int):
+        self.region, self.ready = region, ready
+
+
+class Cellar:
+    """The memory of a program: who writes which cells, and what is read from them."""
+
+    def __init__(self, graph: Graph):
+        self.graph = graph
+        self.size = 0
+        self._starts: list[int] = []
+        self._owners: list[Node | Block] = []
+        self.constants: list[np.ndarray] = []
+        self.num_constants = 0
+        self._constant_starts: list[int] = []
+        self._constant_places: dict[Any, int] = {}
+        # Tables of places that kernels read while they run.
+        self.tables: list[np.ndarray] = []
+        self._table_numbers: dict[bytes, int] = {}
+
+    # Where numbers are --------------------------------------------------------------------
+
+    def new(self, count: int, owner: Node | Block) -> int:
+        """The first of so many new cells."""
+        self._starts.append(self.size)
+        self._owners.append(owner)
+        self.size += count
+        return self._starts[-1]
+
+    def table(self, places: np.ndarray) -> int:
+        """The number of a table."""
+        places = np.ascontiguousarray(places, np.int64)
+        key = places.tobytes()
+        if key not in self._table_numbers:
+            self._table_numbers[key] = len(self.tables)
+            self.tables.append(places)
+        return self._table_numbers[key]
+
+    def place_of(self, x: Number, dtype: str) -> int:
+        """The cell of a number (of its first lane)."""
+        if not isinstance(x, Node):
+            key = _bits(np.array([x], dtype))[0]
+            if key not in self._constant_places:
+                self._constant_places[key] = self._new_constants(np.array([key]))
+            return self._constant_places[key]
+        if x.op == "load" and not x.lanes:
+            return x.extra
+        if x.place is None:
+            count = 1 if x.is_reduced or not x.lanes else x.lanes
+            x.place = self.new(count, x)
+        return x.place
+
+    def places_of_lanes(self, x: Number, dtype: str, n: int) -> np.ndarray:
+        if isinstance(x, Node) and x.lanes and not x.is_reduced:
+            if x.op == "load":
+                return self.loaded_places(x)
+            return self.place_of(x, dtype) + np.arange(n)
+        return np.full(n, self.place_of(x, dtype))
+
+    def loaded_places(self, x: Node) -> np.ndarray:
+        first, stride, table = x.extra
+        if table is not None:
+            return self.tables[table]
+        return first + stride * np.arange(x.lanes)
+
+    def _new_constants(self, cells: np.ndarray) -> int:
+        place = CONSTANTS + self.num_constants
+        self._constant_starts.append(self.num_constants)
+        self.constants.append(cells)
+        self.num_constants += cells.size
+        return place
+
+    def memory(self, value: Value) -> Memory:
+        """The array in memory."""
+        if isinstance(value, Memory):
+            return value
+        if isinstance(value, Cells):
+            return Memory(value.dtype, self._places(value))
+        dtype = type_name(value.dtype)
+        flat = _bits(np.ravel(value))
+        if flat.size == 1:
+            place = np.full(np.shape(value), self.place_of(number_at(value), dtype))
+            return Memory(dtype, place)
+        key = flat.tobytes()
+        if key not in self._constant_places:
+            self._constant_places[key] = self._new_constants(flat)
+        place = self._constant_places[key]
+        return Memory(dtype, (place + np.arange(flat.size)).reshape(np.shape(value)))
+
+    def _places(self, value: Cells) -> np.ndarray:
+        dtype, cells = value.dtype, value.cells
+        if value.lane is None:
+            flat = [self.place_of(x, dtype) for x in cells.ravel()]
+            return np.array(flat, np.int64).reshape(cells.shape)
+        columns = [self.places_of_lanes(x, dtype, value.n) for x in cells.ravel()]
+        moved = np.delete(np.array(cells.shape), value.lane)
+        stacked = np.array(columns, np.int64).reshape(*moved, value.n)
+        return np.moveaxis(stacked, -1, value.lane)
+
+    # What is read -------------------------------------------------------------------------
+
+    def _owner(self, place: int) -> Node | Block:
+        return self._owners[bisect.bisect_right(self._starts, place) - 1]
+
+    def number_at(self, place: int, dtype: str) -> Number:
+        """The number in a cell."""
+        if place >= CONSTANTS:
+            return self._constant_at(place, dtype)
+        owner = self._owner(place)
+        if isinstance(owner, Node) and (owner.is_reduced or not owner.lanes):
+            return owner
+        return self.graph.at(owner.region, owner.ready, "load", dtype, extra=place)
+
+    def _constant_at(self, place: int, dtype: str) -> Number:
+        number = place - CONSTANTS
+        block = bisect.bisect_right(self._constant_starts, number) - 1
+        return from_bits(self.constants[block][number - self._constant_starts[block]], dtype)
+
+    def lanes_at(self, places: np.ndarray, dtype: str) -> Number:
+        """The numbers in a cell for each lane."""
+        first, n = int(places[0]), places.size
+        steps = np.diff(places)
+        stride = int(steps[0])
+        is_affine = bool(np.all(steps == stride))
+        if is_affine and stride == 0:
+            return self.number_at(first, dtype)
+        owners = self._all_owners(places)
+        for owner in owners:
+            if isinstance(owner, Node) and is_affine and stride == 1:
+                if owner.place == first and owner.lanes == n and not owner.is_reduced:
+                    return owner
+        region, level, markers = self._readable(owners)
+        extra = (first, stride, None) if is_affine else (0, 0, self.table(places))
+        return self.graph.at(region, level, "load", dtype, markers, extra, n)
+
+    def readable(self, places: np.ndarray) -> tuple[Region, int, tuple[Node, ...]]:
+        """From where on all cells can be read: the region, the level in it, and markers.
+
+        A marker stands for the level from which cells of a region around it can be read.
+        """
+        return self._readable(self._all_owners(places.ravel()), by_lanes=False)
+
+    def _readable(
+        self, owners: list[Any], by_lanes: bool = True
+    ) -> tuple[Region, int, tuple[Node, ...]]:
+        levels: dict[Region, int] = {}
+        for owner in owners:
+            ready = owner.ready
+            if isinstance(owner, Node) and (owner.is_reduced or not by_lanes):
+                ready = owner.level + 1
+            levels[owner.region] = max(levels.get(owner.region, 0), ready)
+        if not levels:
+            return self.graph.root, 0, ()
+        region = max(levels, key=lambda x: x.depth)
+        others = ((x, level) for x, level in levels.items() if x is not region and level)
+        markers = tuple(self.marker(x, level) for x, level in others)
+        return region, levels[region], markers
+
+    def marker(self, region: Region, level: int) -> Node:
+        return self.graph.at(region, level, "marker", "b1", extra=level)
+
+    def _all_owners(self, places: np.ndarray) -> list[Node | Block]:
+        places = places[places < CONSTANTS]
+        if places.size == 0:
+            return []
+        low = bisect.bisect_right(self._starts, int(places.min())) - 1
+        high = bisect.bisect_right(self._starts, int(places.max())) - 1
+        if high - low > 1:
+            starts = np.array(self._starts[low : high + 1])
+            numbers = np.unique(np.searchsorted(starts, places, side="right") - 1)
+            return [self._owners[low + k] for k in numbers]
+        return self._owners[low : high + 1]
+
+    # Conversions --------------------------------------------------------------------------
+
+    def unlaned(self, value: Value) -> np.ndarray:
+        """The numbers of an array, one by one."""
+        if isinstance(value, Cells):
+            if value.lane is None:
+                return value.cells
+            value = self.memory(value)
+        if isinstance(value, Memory):
+            flat = [self.number_at(int(p), value.dtype) for p in value.places.ravel()]
+            return objects(flat, value.shape)
+        return objects(np.ravel(value).tolist(), np.shape(value))
+
+    def laned(self, value: Value, lane: int) -> np.ndarray:
+        """The numbers of an array with an axis of lanes, of which one entry remains."""
+        if isinstance(value, Cells):
+            if value.lane == lane:
+                return value.cells
+            value = self.memory(value)
+        kept = list(value.shape)
+        kept[lane] = 1
+        if isinstance(value, Memory):
+            columns = np.moveaxis(value.places, lane, -1).reshape(-1, value.shape[lane])
+            flat = [self.lanes_at(x, value.dtype) for x in columns]
+            return objects(flat, tuple(kept))
+        columns = np.moveaxis(value, lane, -1).reshape(-1, value.shape[lane])
+        flat = [self._known_lanes(x) for x in columns]
+        return objects(flat, tuple(kept))
+
+    def _known_lanes(self, x: np.ndarray) -> Number:
+        bits = _bits(x)
+        if np.all(bits == bits[0]):
+            return number_at(x[:1])
+        memory = self.memory(x)
+        return self.lanes_at(memory.places, memory.dtype)
+
+    def contiguous(self, value: Value) -> Memory:
+        """The array in memory, in the order of its entries."""
+        memory = self.memory(value)
+        flat = memory.places.ravel()
+        if flat.size < 2 or np.all(np.diff(flat) == 1):
+            return memory
+        if flat.size < _FEWEST_LANES:
+            copies = [
+                self.graph.node(
+                    "copy", memory.dtype, (self.number_at(int(p), memory.dtype),), (k, self.size)
+                )
+                for k, p in enumerate(flat)
+            ]
+            places = np.array([self.place_of(x, memory.dtype) for x in copies])
+            return Memory(memory.dtype, places.reshape(memory.shape))
+        x = self.lanes_at(flat, memory.dtype)
+        copy = self.graph.node("copy", memory.dtype, (x,), lanes=flat.size)
+        places = self.place_of(copy, memory.dtype) + np.arange(flat.size)
+        return Memory(memory.dtype, places.reshape(memory.shape))
+
+
+def lane_of(values: list[Value], shape: tuple[int, ...]) -> int | None:
+    """The axis of the lanes of an array that is computed from others of its shape."""
+    for value in values:
+        if isinstance(value, Cells) and value.lane is not None and value.shape == shape:
+            return value.lane
+    return usual_lane(shape)
+
+
+def usual_lane(shape: tuple[int, ...]) -> int | None:
+    size, longest = int(np.prod(shape)), max(shape, default=0)
+    if longest < _FEWEST_LANES or (size <= _SMALL and longest < 12):
+        return None
+    return shape.index(longest)
+
+
+def objects(flat: list[Any], shape: tuple[int, ...]) -> np.ndarray:
+    out = np.empty(len(flat), object)
+    out[:] = flat
+    return out.reshape(shape)
+
+
+def number_at(value: Any) -> Number:
+    """The only number of an array."""
+    x = np.ravel(value)[0]
+    return as_number(x, type_name(x.dtype))
+
+
+def _bits(x: np.ndarray) -> np.ndarray:
+    """Numbers as they are stored in cells."""
+    kind = x.dtype.kind
+    if kind == "f":
+        return x.astype(np.float64).view(np.int64)
+    return x.astype(np.int64)
+
+
+def from_bits(cell: Any, dtype: str) -> Number:
+    if dtype[0] == "f":
+        return float(np.asarray(cell, np.int64).view(np.float64)[()])
+    return number_type(dtype)(cell)
