@@ -7,7 +7,7 @@ branches.
 """
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from .values import Cellar, CONSTANTS
 
 
 # The number of lanes that a kernel takes at a time.
-_WIDTH = 4
+WIDTH = 4
 # Kernels of single numbers with more operations are divided: the time of compilation grows
 # faster than their length.
 _LONGEST = 2_500
@@ -46,9 +46,16 @@ class Emission:
         self._kernel_of = {
             x: number for number, nodes in enumerate(self.kernels.values()) for x in nodes
         }
+        self._recurrences = _recurrences(regions, self.kernels)
         self._make_places()
         self._by_region: dict[Region, dict[int, list[str]]] = {}
+        for item, nodes in self._recurrences.values():
+            kernel = _Recurrence(self, self._kernel_of[nodes[0]], nodes, item)
+            self.functions.append(kernel.text(f"@r{item.counter}"))
+            self.length += len(nodes)
         for number, ((region, level, lanes, _), nodes) in enumerate(self.kernels.items()):
+            if region in self._recurrences:
+                continue
             name = f"@k{number}"
             kernel = _Kernel(self, number, nodes, lanes)
             self.functions.append(kernel.text(name))
@@ -75,6 +82,8 @@ class Emission:
             for node in nodes:
                 for x in node.operands:
                     if not isinstance(x, Node) or x.op in ("load", "marker"):
+                        continue
+                    if x.region is node.region and x.region in self._recurrences:
                         continue
                     if self._kernel_of[x] != number or x.is_reduced:
                         self.cellar.place_of(x, x.dtype)
@@ -123,6 +132,9 @@ class Emission:
         return name
 
     def _scan(self, item: Scan) -> None:
+        if item.body in self._recurrences:
+            self._say(f"call void @r{item.counter}(ptr %m)")
+            return
         loop, end = self._label(), self._label()
         begin = self._block
         self._say(f"br label %{loop}")
@@ -214,12 +226,46 @@ def _kernels(regions: list[Region]) -> dict[tuple, list[Node]]:
     return kernels
 
 
+def _recurrences(
+    regions: list[Region], kernels: dict[tuple, list[Node]]
+) -> dict[Region, tuple[Scan, list[Node]]]:
+    """The loops over single numbers, such as the elimination along a chain.
+
+    Their carry stays in registers.
+    """
+    of_region: dict[Region, list[Node]] = {}
+    for (region, *_), nodes in kernels.items():
+        of_region.setdefault(region, []).extend(nodes)
+    found = {}
+    for region in regions:
+        for item in region.items:
+            if not isinstance(item, Scan):
+                continue
+            body, nodes = item.body, of_region.get(item.body, [])
+            if body.items or not nodes or len(nodes) > _LONGEST:
+                continue
+            if any(x.lanes or _reads_cells_of(body, x) for x in nodes):
+                continue
+            found[body] = item, sorted(nodes, key=lambda x: (x.level, x.number))
+    return found
+
+
+def _reads_cells_of(region: Region, node: Node) -> bool:
+    """Whether a number is found at a computed cell that the region itself writes."""
+    markers = (x for x in node.operands[1:] if isinstance(x, Node) and x.op == "marker")
+    return node.op == "dynamic" and any(x.region is region for x in markers)
+
+
 class _Kernel:
     """The function of a kernel."""
 
     def __init__(self, emission: Emission, number: int, nodes: list[Node], lanes: int):
         self.emission, self.number, self.nodes = emission, number, nodes
         self.lanes = lanes
+        # What runs once is compiled quickly, and takes one lane at a time.
+        self.once = not nodes[0].region.depth
+        self.width = 1 if self.once else WIDTH
+        self.attributes = "#2" if self.once else "#0"
         self.before: list[str] = []
         self.lines: list[str] = []
         self.count = 0
@@ -251,7 +297,7 @@ class _Kernel:
         for node in stores:
             self._store(node)
         body = "\n".join(self.lines)
-        return f"define internal void {name}(ptr %m) #0 {{\n{body}\n  ret void\n}}\n"
+        return f"define internal void {name}(ptr %m) {self.attributes} {{\n{body}\n  ret void\n}}\n"
 
     def _loop(self, name: str) -> str:
         n = self.lanes
@@ -267,23 +313,23 @@ class _Kernel:
                 if node.place is not None:
                     writes.append(node)
                     self._write(self.names[node], node.dtype, node.place)
-        head = [f"define internal void {name}(ptr %m) #0 {{", "entry:", *self.before]
+        head = [f"define internal void {name}(ptr %m) {self.attributes} {{", "entry:", *self.before]
         head += ["  br label %loop", "loop:"]
         head += ["  %j = phi i64 [ 0, %entry ], [ %next, %loop ]"]
         head += [
-            f"  {acc} = phi {self._t(node.dtype)} [ {_neutral(node)}, %entry ], "
+            f"  {acc} = phi {self._t(node.dtype)} [ {self._neutral(node)}, %entry ], "
             f"[ {after}, %loop ]"
             for node, acc, after in reductions
         ]
         # The last four lanes may overlap those before them, which are computed again.
         head += [
-            f"  %short = icmp ult i64 {n - _WIDTH}, %j",
-            f"  %i = select i1 %short, i64 {n - _WIDTH}, i64 %j",
+            f"  %short = icmp ult i64 {n - self.width}, %j",
+            f"  %i = select i1 %short, i64 {n - self.width}, i64 %j",
         ]
-        if reductions and n % _WIDTH:
+        if reductions and n % self.width:
             head += self._mask()
         tail = [
-            f"  %next = add i64 %j, {_WIDTH}",
+            f"  %next = add i64 %j, {self.width}",
             f"  %more = icmp ult i64 %next, {n}",
             "  br i1 %more, label %loop, label %end",
             "end:",
@@ -294,21 +340,27 @@ class _Kernel:
         return "\n".join([*head, *body, *tail, *self.lines, "  ret void", "}", ""])
 
     def _mask(self) -> list[str]:
-        """Which of the four lanes have not been computed before."""
-        lines = ["  %behind = sub i64 %j, %i"]
-        lines += ["  %mask0 = insertelement <4 x i64> poison, i64 %behind, i64 0"]
-        lines += [
-            "  %mask1 = shufflevector <4 x i64> %mask0, <4 x i64> poison, "
-            "<4 x i32> zeroinitializer"
+        """Which lanes of those that are taken have not been computed before."""
+        vector = f"<{self.width} x i64>"
+        numbers = ", ".join(f"i64 {k}" for k in range(self.width))
+        return [
+            "  %behind = sub i64 %j, %i",
+            f"  %mask0 = insertelement {vector} poison, i64 %behind, i64 0",
+            f"  %mask1 = shufflevector {vector} %mask0, {vector} poison, "
+            f"<{self.width} x i32> zeroinitializer",
+            f"  %mask = icmp uge {vector} <{numbers}>, %mask1",
         ]
-        lines += ["  %mask = icmp uge <4 x i64> <i64 0, i64 1, i64 2, i64 3>, %mask1"]
-        return lines
 
     # Values -------------------------------------------------------------------------------
 
     def _t(self, dtype: str) -> str:
         kind = _TYPES[dtype]
-        return f"<{_WIDTH} x {kind}>" if self.lanes else kind
+        return f"<{self.width} x {kind}>" if self._is_wide else kind
+
+    @property
+    def _is_wide(self) -> bool:
+        """Whether numbers are vectors of several lanes."""
+        return bool(self.lanes) and self.width > 1
 
     def _say(self, text: str) -> str:
         name = self._new()
@@ -319,7 +371,7 @@ class _Kernel:
         """The name of an operand, or the text of a known number."""
         if not isinstance(x, Node):
             text = literal(x, dtype)
-            return f"splat ({_TYPES[dtype]} {text})" if self.lanes else text
+            return f"splat ({_TYPES[dtype]} {text})" if self._is_wide else text
         name = self.names.get(x)
         if name is not None:
             return name
@@ -353,10 +405,12 @@ class _Kernel:
 
     def _spread(self, x: str, dtype: str) -> str:
         kind = _TYPES[dtype]
-        one = self._say(f"insertelement <{_WIDTH} x {kind}> poison, {kind} {x}, i64 0")
+        if self.width == 1:
+            return x
+        one = self._say(f"insertelement <{self.width} x {kind}> poison, {kind} {x}, i64 0")
         return self._say(
-            f"shufflevector <{_WIDTH} x {kind}> {one}, <{_WIDTH} x {kind}> poison, "
-            f"<{_WIDTH} x i32> zeroinitializer"
+            f"shufflevector <{self.width} x {kind}> {one}, <{self.width} x {kind}> poison, "
+            f"<{self.width} x i32> zeroinitializer"
         )
 
     def _pointer(self, place: int) -> str:
@@ -366,7 +420,7 @@ class _Kernel:
 
     def _load_cell(self, pointer: str, dtype: str) -> str:
         kind = "double" if dtype[0] == "f" else "i64"
-        kind = f"<{_WIDTH} x {kind}>" if self.lanes else kind
+        kind = f"<{self.width} x {kind}>" if self._is_wide else kind
         return self._say(f"load {kind}, ptr {pointer}, align 8")
 
     def _narrowed(self, x: str, dtype: str) -> str:
@@ -374,7 +428,7 @@ class _Kernel:
         if dtype in ("f8", "i8", "u8"):
             return x
         wide = "double" if dtype == "f4" else "i64"
-        wide = f"<{_WIDTH} x {wide}>" if self.lanes else wide
+        wide = f"<{self.width} x {wide}>" if self._is_wide else wide
         how = "fptrunc" if dtype == "f4" else "trunc"
         return self._say(f"{how} {wide} {x} to {self._t(dtype)}")
 
@@ -382,18 +436,18 @@ class _Kernel:
         if dtype in ("f8", "i8", "u8"):
             return x
         wide = "double" if dtype == "f4" else "i64"
-        wide = f"<{_WIDTH} x {wide}>" if self.lanes else wide
+        wide = f"<{self.width} x {wide}>" if self._is_wide else wide
         how = "fpext" if dtype == "f4" else "sext" if dtype[0] == "i" else "zext"
         return self._say(f"{how} {self._t(dtype)} {x} to {wide}")
 
     def _cell_type(self, dtype: str) -> str:
         kind = "double" if dtype[0] == "f" else "i64"
-        return f"<{_WIDTH} x {kind}>" if self.lanes else kind
+        return f"<{self.width} x {kind}>" if self._is_wide else kind
 
-    def _lane_pointers(self, first: int, stride: int, table: int | None) -> list[str]:
+    def _lane_pointers(self, first: int | None, stride: int, table: int | None) -> list[str]:
         """The cells of the four lanes."""
         out = []
-        for k in range(_WIDTH):
+        for k in range(self.width):
             lane = "%i" if k == 0 else self._once(("lane", k), f"add i64 %i, {k}")
             if table is not None:
                 at = self._once(
@@ -402,9 +456,12 @@ class _Kernel:
                 )
                 index = self._once(("index", table, k), f"load i64, ptr {at}")
             else:
-                offset = self._once(("offset", stride, k), f"mul i64 {lane}, {stride}")
-                index = self._say(f"add i64 {offset}, {self.emission.address(first)}")
-            out.append(self._say(f"getelementptr double, ptr %m, i64 {index}"))
+                index = self._once(("offset", stride, k), f"mul i64 {lane}, {stride}")
+            row = self._once(
+                ("row", table, stride, k), f"getelementptr double, ptr %m, i64 {index}"
+            )
+            address = 0 if first is None else self.emission.address(first)
+            out.append(self._say(f"getelementptr double, ptr {row}, i64 {address}"))
         return out
 
     def _once(self, key: tuple, text: str) -> str:
@@ -412,8 +469,8 @@ class _Kernel:
             self._found[key] = self._say(text)
         return self._found[key]
 
-    def _read_lanes(self, dtype: str, first: int, stride: int, table: int | None) -> str:
-        if stride == 1 and table is None:
+    def _read_lanes(self, dtype: str, first: int | None, stride: int, table: int | None) -> str:
+        if stride == 1 and table is None and first is not None:
             base = self._pointer_at_lane(first)
             return self._narrowed(self._load_cell(base, dtype), dtype)
         return self._gathered(self._lane_pointers(first, stride, table), dtype)
@@ -424,7 +481,10 @@ class _Kernel:
 
     def _gathered(self, pointers: list[str], dtype: str) -> str:
         kind = "double" if dtype[0] == "f" else "i64"
-        vector = f"<{_WIDTH} x {kind}>"
+        if self.width == 1:
+            one = self._say(f"load {kind}, ptr {pointers[0]}, align 8")
+            return self._narrowed(one, dtype)
+        vector = f"<{self.width} x {kind}>"
         out = "poison"
         for k, pointer in enumerate(pointers):
             one = self._say(f"load {kind}, ptr {pointer}, align 8")
@@ -462,7 +522,7 @@ class _Kernel:
         for k, pointer in enumerate(self._lane_pointers(first, stride, table)):
             if offset is not None:
                 pointer = self._say(f"getelementptr double, ptr {pointer}, i64 {offset}")
-            one = self._say(f"extractelement {self._cell_type(dtype)} {value}, i64 {k}")
+            one = self._element(self._cell_type(dtype), value, k)
             self.lines.append(f"  store {kind} {one}, ptr {pointer}, align 8")
 
     def _row_offset(self, counter: Node, row: int) -> str:
@@ -507,6 +567,11 @@ class _Kernel:
             return xs[0]
         return getattr(self, f"_{op}")(dtype, node, *xs)
 
+    def _element(self, vector: str, x: str, k: int) -> str:
+        if self.width == 1:
+            return x
+        return self._say(f"extractelement {vector} {x}, i64 {k}")
+
     def _dynamic(self, node: Node) -> str:
         (offset, *_), (first, stride) = node.operands, node.extra
         dtype = node.dtype
@@ -518,8 +583,8 @@ class _Kernel:
         if isinstance(offset, Node) and offset.lanes and not offset.is_reduced:
             name = self._value(offset, "i8")
             pointers = []
-            for k in range(_WIDTH):
-                one = self._say(f"extractelement <{_WIDTH} x i64> {name}, i64 {k}")
+            for k in range(self.width):
+                one = self._element(f"<{self.width} x i64>", name, k)
                 index = self._say(f"add i64 {one}, {self.emission.address(first)}")
                 pointers.append(self._say(f"getelementptr double, ptr %m, i64 {index}"))
             return self._gathered(pointers, dtype)
@@ -564,7 +629,7 @@ class _Kernel:
     def _whole_division(self, op, dtype, a, b):
         """Division by zero would end the process."""
         t, sign = self._t(dtype), "s" if dtype[0] == "i" else "u"
-        mask = f"<{_WIDTH} x i1>" if self.lanes else "i1"
+        mask = self._t("b1")
         zero, one = self._value(0, dtype), self._value(1, dtype)
         is_zero = self._say(f"icmp eq {t} {b}, {zero}")
         b = self._say(f"select {mask} {is_zero}, {t} {one}, {t} {b}")
@@ -609,7 +674,7 @@ class _Kernel:
 
     def _intrinsic(self, name, dtype, *xs, more=""):
         t = self._t(dtype)
-        suffix = ("v4" if self.lanes else "") + (
+        suffix = ("v4" if self._is_wide else "") + (
             {"f8": "f64", "f4": "f32"}.get(dtype) or _TYPES[dtype]
         )
         whole = f"@llvm.{name}.{suffix}"
@@ -666,7 +731,7 @@ class _Kernel:
 
     def _saturated(self, dtype, of, x):
         t, from_type = self._t(dtype), self._t(of)
-        suffix = "v4" if self.lanes else ""
+        suffix = "v4" if self._is_wide else ""
         source = {"f8": "f64", "f4": "f32"}[of]
         sign = "s" if dtype[0] == "i" else "u"
         name = f"@llvm.fpto{sign}i.sat.{suffix}{_TYPES[dtype]}.{suffix}{source}"
@@ -682,17 +747,17 @@ class _Kernel:
         whole = f"@{name}" + ("f" if dtype == "f4" else "")
         types = ", ".join([kind] * len(xs))
         self.emission.declared.add(f"declare {kind} {whole}({types}) #1")
-        if not self.lanes:
+        if not self._is_wide:
             given = ", ".join(f"{kind} {x}" for x in xs)
             return self._say(f"call {kind} {whole}({given})")
         out = "poison"
-        for k in range(_WIDTH):
+        for k in range(self.width):
             ones = [
-                self._say(f"extractelement <{_WIDTH} x {kind}> {x}, i64 {k}") for x in xs
+                self._say(f"extractelement <{self.width} x {kind}> {x}, i64 {k}") for x in xs
             ]
             given = ", ".join(f"{kind} {x}" for x in ones)
             one = self._say(f"call {kind} {whole}({given})")
-            out = self._say(f"insertelement <{_WIDTH} x {kind}> {out}, {kind} {one}, i64 {k}")
+            out = self._say(f"insertelement <{self.width} x {kind}> {out}, {kind} {one}, i64 {k}")
         return out
 
     # Reductions ---------------------------------------------------------------------------
@@ -702,10 +767,10 @@ class _Kernel:
         acc, (x,) = self._new(), node.operands
         dtype, op = node.dtype, node.op.split()[1]
         value = self._value(x, dtype)
-        if self.lanes % _WIDTH:
+        if self.lanes % self.width:
             t = self._t(dtype)
             value = self._say(
-                f"select <{_WIDTH} x i1> %mask, {t} {value}, {t} {_neutral(node)}"
+                f"select <{self.width} x i1> %mask, {t} {value}, {t} {self._neutral(node)}"
             )
         after = getattr(self, f"_{op}")(dtype, node, acc, value)
         return node, acc, after
@@ -713,33 +778,105 @@ class _Kernel:
     def _reduced(self, node: Node, total: str) -> None:
         dtype, op = node.dtype, node.op.split()[1]
         t = self._t(dtype)
-        ones = [self._say(f"extractelement {t} {total}, i64 {k}") for k in range(_WIDTH)]
+        ones = [self._element(t, total, k) for k in range(self.width)]
         lanes, self.lanes = self.lanes, 0
         join = getattr(self, f"_{op}")
-        low, high = join(dtype, node, *ones[:2]), join(dtype, node, *ones[2:])
-        out = join(dtype, node, low, high)
+        while len(ones) > 1:
+            half = len(ones) // 2
+            pairs = zip(ones[:half], ones[half:], strict=True)
+            ones = [join(dtype, node, a, b) for a, b in pairs]
+        (out,) = ones
         if node.place is not None:
             self._write(out, dtype, node.place)
         self.lanes = lanes
 
+    def _neutral(self, node: Node) -> str:
+        dtype, op = node.dtype, node.op.split()[1]
+        kind = _TYPES[dtype]
+        if op in ("add", "or", "xor"):
+            x = 0
+        elif op == "mul":
+            x = 1
+        elif op == "and":
+            x = True if dtype == "b1" else -1
+        elif dtype[0] == "f":
+            x = float("-inf") if op == "max" else float("inf")
+        elif dtype == "b1":
+            x = op == "min"
+        else:
+            info = np.iinfo(dtype)
+            x = int(info.min if op == "max" else info.max)
+        text = literal(x, dtype)
+        return f"splat ({kind} {text})" if self.width > 1 else text
 
-def _neutral(node: Node) -> str:
-    dtype, op = node.dtype, node.op.split()[1]
-    kind = _TYPES[dtype]
-    if op in ("add", "or", "xor"):
-        x = 0
-    elif op == "mul":
-        x = 1
-    elif op == "and":
-        x = True if dtype == "b1" else -1
-    elif dtype[0] == "f":
-        x = float("-inf") if op == "max" else float("inf")
-    elif dtype == "b1":
-        x = op == "min"
-    else:
-        info = np.iinfo(dtype)
-        x = int(info.min if op == "max" else info.max)
-    return f"splat ({kind} {literal(x, dtype)})"
+
+
+class _Recurrence(_Kernel):
+    """The function of a loop over single numbers."""
+
+    def __init__(self, emission: Emission, number: int, nodes: list[Node], item: Scan):
+        super().__init__(emission, number, nodes, 0)
+        self.item = item
+        stores = [x for x in nodes if x.op == "store"]
+        self.commits = {x.extra[0]: x for x in stores if len(x.operands) == 1}
+        self.rows = [x for x in stores if len(x.operands) == 2]
+        self.attributes = "#0"
+
+    def text(self, name: str) -> str:
+        item = self.item
+        carry = {}
+        for place, node in self.commits.items():
+            first = self._before(lambda: self._single_at(place, node.dtype))
+            carry[place] = self._new(), first
+        self.carry = {place: phi for place, (phi, _) in carry.items()}
+        for node in self.nodes:
+            if node.op != "store":
+                self.names[node] = self._compute(node)
+        after = {
+            place: self._value(node.operands[0], node.dtype)
+            for place, node in self.commits.items()
+        }
+        for node in self.rows:
+            self._store(node)
+        head = [f"define internal void {name}(ptr %m) {self.attributes} {{", "entry:"]
+        head += [*self.before, "  br label %loop", "loop:"]
+        head += ["  %j = phi i64 [ 0, %entry ], [ %next, %loop ]"]
+        head += [
+            f"  {phi} = phi {self._t(self.commits[place].dtype)} "
+            f"[ {first}, %entry ], [ {after[place]}, %loop ]"
+            for place, (phi, first) in carry.items()
+        ]
+        number = "%j" if not item.reverse else f"sub i64 {item.length - 1}, %j"
+        head += [f"  %count = {number}" if item.reverse else "  %count = add i64 %j, 0"]
+        tail = [
+            "  %next = add i64 %j, 1",
+            f"  %more = icmp ult i64 %next, {item.length}",
+            "  br i1 %more, label %loop, label %end",
+            "end:",
+        ]
+        body, self.lines = self.lines, []
+        for place, node in self.commits.items():
+            self._write(after[place], node.dtype, place)
+        return "\n".join([*head, *body, *tail, *self.lines, "  ret void", "}", ""])
+
+    def _before(self, make: Callable[[], str]) -> str:
+        """What is computed before the loop."""
+        lines, self.lines = self.lines, self.before
+        name = make()
+        self.before, self.lines = self.lines, lines
+        return name
+
+    def _value(self, x: Number, dtype: str) -> str:
+        if isinstance(x, Node) and x not in self.names:
+            if x.op == "load" and x.extra == self.item.counter:
+                return "%count"
+            if x.op == "load" and x.extra in self.carry:
+                return self.carry[x.extra]
+            self.names[x] = self._before(lambda: super(_Recurrence, self)._value(x, dtype))
+        return super()._value(x, dtype)
+
+    def _row_offset(self, counter: Node, row: int) -> str:
+        return self._once(("row", row), f"mul i64 {self._value(counter, 'i8')}, {row}")
 
 
 def literal(x: Number, dtype: str) -> str:

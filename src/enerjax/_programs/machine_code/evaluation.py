@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
 
-from ..jaxprs import solution_program, wrapped_program
+from ..jaxprs import programs_within, solution_program, wrapped_program
 from ..numpy_primitives import (
     evaluated,
     FUNCTIONS as FUNCTIONS_OF_NUMPY,
@@ -28,6 +28,7 @@ from .graph import Graph, Node, Number
 from .values import (
     Cellar,
     Cells,
+    CONSTANTS,
     dtype_of,
     lane_of,
     Memory,
@@ -53,9 +54,11 @@ _SAME = frozenset(
 class Evaluation:
     """Evaluates programs in the current region of a graph."""
 
-    def __init__(self):
+    def __init__(self, rows_of: dict[int, tuple[int, int]] | None = None):
         self.graph = Graph()
         self.cellar = Cellar(self.graph)
+        # The rows in which vectors of some lengths are read.
+        self.rows_of = rows_of or {}
 
     def outputs(self, jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Value]:
         """The values of the outputs of a program."""
@@ -155,6 +158,10 @@ class Evaluation:
             return self._as_one_axis(rule, values, shape, dtype)
         if lane is None and size > MOST_CELLS:
             return self._as_one_axis(rule, values, shape, dtype)
+        if lane is not None and not any(map(_is_laned, values)):
+            found = self._by_columns(rule, values, shape, dtype)
+            if found is not None:
+                return found
         columns, kept = [], list(shape)
         if lane is not None:
             kept[lane] = 1
@@ -168,6 +175,38 @@ class Evaluation:
                 columns.append(self.cellar.laned(x, lane).ravel().tolist())
         cells = objects([rule(*xs) for xs in zip(*columns, strict=True)], tuple(kept))
         return self.cells(dtype, cells, lane, 1 if lane is None else shape[lane])
+
+    def _by_columns(self, rule, values, shape, dtype) -> Value | None:
+        """The same by the columns in which operands are stored, if they are."""
+        own = [x for x in values if isinstance(x, Memory) and x.shape == shape]
+        leader = next((x for x in own if x.places.min() < CONSTANTS), None)
+        if leader is None:
+            return None
+        found = self.cellar.columns(leader.places.ravel())
+        if found is None:
+            return None
+        parts, others = found
+        flat: list[Any] = []
+        for x in values:
+            if x.shape != shape:
+                flat.append(self.cellar.unlaned(x).item())
+            else:
+                memory = self.cellar.memory(x)
+                flat.append((memory.places.ravel(), memory.dtype))
+        places = np.zeros(leader.places.size, np.int64)
+        for part in parts:
+            xs = [
+                self.cellar.lanes_at(x[0][part], x[1]) if isinstance(x, tuple) else x
+                for x in flat
+            ]
+            places[part] = self.cellar.places_of_lanes(rule(*xs), dtype, part.size)
+        for k in others.tolist():
+            xs = [
+                self.cellar.number_at(int(x[0][k]), x[1]) if isinstance(x, tuple) else x
+                for x in flat
+            ]
+            places[k] = self.cellar.place_of(rule(*xs), dtype)
+        return Memory(dtype, places.reshape(shape))
 
     def _spread(self, x: Value, shape: tuple[int, ...]) -> Value:
         """An operand whose axes of length 1 stand for longer ones."""
@@ -296,6 +335,10 @@ class Evaluation:
         kept_shape = tuple(n for k, n in enumerate(shape) if k not in axes)
         if math.prod(shape) == 0:
             raise Unsupported("a reduction of no numbers")
+        if not kept_shape and isinstance(value, Memory):
+            found = self._reduced_by_columns(op, value)
+            if found is not None:
+                return found
         lane = lane_of([value], shape)
         cells_beside = math.prod(shape) // (1 if lane is None else shape[lane])
         if cells_beside > MOST_CELLS:
@@ -316,6 +359,24 @@ class Evaluation:
         at = None if lane is None else order.index(lane)
         n = 1 if lane is None else shape[lane]
         return self.cells(dtype, objects(flat, tuple(first)), at, n)
+
+    def _reduced_by_columns(self, op: str, value: Memory) -> Value | None:
+        places, dtype = value.places.ravel(), value.dtype
+        found = None if places.size < 12 else self.cellar.columns(places)
+        if found is None:
+            return None
+        join = lambda a, b: self.graph.op(op, dtype, (a, b))
+        by_length: dict[int, list[Number]] = {}
+        for part in found[0]:
+            x = self.cellar.lanes_at(places[part], dtype)
+            by_length.setdefault(part.size, []).append(x)
+        totals = [
+            self._over_lanes(op, dtype, functools.reduce(join, xs), n)
+            for n, xs in by_length.items()
+        ]
+        totals += [self.cellar.number_at(int(p), dtype) for p in places[found[1]]]
+        total = functools.reduce(join, totals)
+        return self.cells(dtype, objects([total], ()), None, 1)
 
     def _over_lanes(self, op: str, dtype: str, x: Number, n: int) -> Number:
         if isinstance(x, Node) and x.lanes and not x.is_reduced:
@@ -355,6 +416,31 @@ class Evaluation:
             for x in rows
         ]
         return self.cells(memory.dtype, objects(flat, tuple(kept)), None, 1)
+
+
+def _is_laned(x: Value) -> bool:
+    return isinstance(x, Cells) and x.lane is not None
+
+
+def rows_of_vectors(jaxpr: Any) -> dict[int, tuple[int, int]]:
+    """The rows in which most vectors of a length are read: `(rows, entries of each)`."""
+    counts: dict[int, dict[tuple[int, int], int]] = {}
+
+    def look(jaxpr: Any) -> None:
+        for eqn in jaxpr.eqns:
+            if eqn.primitive.name == "reshape":
+                (before,), after = eqn.invars, eqn.outvars[0].aval.shape
+                if before.aval.ndim == 1 and len(after) == 2 and after[0] > 4:
+                    own = counts.setdefault(before.aval.size, {})
+                    own[after] = own.get(after, 0) + 1
+            if eqn.primitive.name == NAME:
+                look(eqn.params["program"].jaxpr)
+            else:
+                for inner in programs_within(eqn):
+                    look(inner)
+
+    look(jaxpr)
+    return {size: max(own, key=own.__getitem__) for size, own in counts.items()}
 
 
 def _is_unlaned(x: Value) -> bool:

@@ -11,8 +11,8 @@ import jax
 import numpy as np
 
 from .emission import Emission
-from .evaluation import Evaluation
-from .values import Block, dtype_of, Memory, type_name, Value
+from .evaluation import Evaluation, rows_of_vectors
+from .values import Block, CONSTANTS, dtype_of, Memory, type_name, Value
 
 
 _CODES = {"f8": "double", "f4": "float", "b1": "i8"} | {
@@ -38,7 +38,7 @@ def compiled_function(
 
     Raises `Unsupported`.
     """
-    evaluation = Evaluation()
+    evaluation = Evaluation(rows_of_vectors(jaxpr))
     cellar = evaluation.cellar
     variables = [*jaxpr.constvars, *jaxpr.invars]
     values: list[Value] = []
@@ -75,7 +75,10 @@ def _function(emission: Emission, inputs: list, outputs: list) -> Function:
     main = emission.main()
     copies = _copies(emission, inputs, outputs)
     constants = np.concatenate([np.zeros(0, np.int64), *cellar.constants])
-    tables = [emission.addresses(x) for x in cellar.tables]
+    # Tables of distances have no constants' cells.
+    tables = [
+        emission.addresses(x) if np.any(x >= CONSTANTS) else x for x in cellar.tables
+    ]
     size = 8 * (cellar.num_constants + cellar.size)
     handler = _HANDLER.replace("$SIZE$", str(max(size, 8)))
     handler = handler.replace("$CONSTANTS$", str(8 * constants.size))
@@ -87,6 +90,7 @@ def _function(emission: Emission, inputs: list, outputs: list) -> Function:
         _helpers(),
         handler,
         'attributes #0 = { nounwind noinline "no-trapping-math"="true" }',
+        "attributes #2 = { nounwind noinline optnone }",
         "attributes #1 = { nounwind willreturn memory(none) }",
     ])
     digest = hashlib.sha256(text.encode())
@@ -127,7 +131,7 @@ def _copies(emission: Emission, inputs: list, outputs: list) -> tuple[str, str]:
                 f"  call void @out_{dtype}(ptr %oe{k}, ptr %od{k}, i64 {places.size})",
             ]
         else:
-            table = emission.cellar.table(places)
+            table = emission.cellar.table(addresses)
             after.append(
                 f"  call void @pick_{dtype}(ptr %m, ptr inttoptr (i64 $T{table}$ to ptr), "
                 f"ptr %od{k}, i64 {places.size})"

@@ -11,6 +11,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from jax.extend.core import Literal
 
+from ..counting import num_equations
 from .graph import Node, Number, Region
 from .values import (
     Block,
@@ -31,8 +32,8 @@ if TYPE_CHECKING:
     from .evaluation import Evaluation
 
 
-# Loops with no more passes than this are written out.
-_UNROLLED = 3
+# Loops with no more operations than this in all passes are written out.
+_WRITTEN_OUT = 150
 
 
 class Scan:
@@ -122,9 +123,11 @@ def _store(
     else:
         steps = np.diff(places)
         affine = steps.size == 0 or bool(np.all(steps == steps[0]))
-        step = int(steps[0]) if steps.size else 1
-        table = None if affine else self.cellar.table(places)
-        extra, lanes = (int(places[0]), step, table, stride), places.size
+        step, lanes = int(steps[0]) if steps.size else 1, places.size
+        first, step, table = (
+            (int(places[0]), step, None) if affine else self.cellar.scattered(places)
+        )
+        extra = first, step, table, stride
     return self.graph.at(region, level, "store", dtype, operands, extra, lanes)
 
 
@@ -140,14 +143,8 @@ def _stores(
     """Writes an array to cells."""
     if math.prod(value.shape) == 0:
         return []
-    dtype, lane = dtype_of(value), _lane(value)
-    if lane is None:
-        numbers = self.cellar.unlaned(value).ravel().tolist()
-        cells = [int(p) for p in places.ravel()]
-    else:
-        n = value.shape[lane]
-        numbers = self.cellar.laned(value, lane).ravel().tolist()
-        cells = list(np.moveaxis(places, lane, -1).reshape(-1, n))
+    dtype = dtype_of(value)
+    numbers, cells = _numbers(self, value, places)
     out = []
     for x, at in zip(numbers, cells, strict=True):
         if isinstance(x, Node) and x.op == "load" and counter is None:
@@ -158,6 +155,27 @@ def _stores(
             now = max(now, x.level + 1 if x.is_reduced else x.level)
         out.append(_store(self, x, dtype, at, region, now, counter, stride))
     return out
+
+
+def _numbers(
+    self: "Evaluation", value: Value, places: np.ndarray
+) -> tuple[list[Number], list[Any]]:
+    """The numbers of an array, with the cells that they are written to."""
+    if not isinstance(value, Cells):
+        found = self.cellar.columns(places.ravel())
+        if found is not None:
+            memory, to = self.cellar.memory(value).places.ravel(), places.ravel()
+            dtype, parts = dtype_of(value), found[0]
+            numbers = [self.cellar.lanes_at(memory[x], dtype) for x in parts]
+            numbers += [self.cellar.number_at(int(p), dtype) for p in memory[found[1]]]
+            return numbers, [*(to[x] for x in parts), *to[found[1]].tolist()]
+    lane = _lane(value)
+    if lane is None:
+        numbers = self.cellar.unlaned(value).ravel().tolist()
+        return numbers, places.ravel().tolist()
+    n = value.shape[lane]
+    numbers = self.cellar.laned(value, lane).ravel().tolist()
+    return numbers, list(np.moveaxis(places, lane, -1).reshape(-1, n))
 
 
 def _is_in_place(self: "Evaluation", x: Node, at: Any) -> bool:
@@ -176,14 +194,45 @@ def _lane(value: Value) -> int | None:
     return lane
 
 
-def _block_places(self: "Evaluation", value: Any, shape: tuple[int, ...], first: int):
-    """Cells for an array; the entries of the lanes of each number are neighbours."""
-    size = math.prod(shape)
-    lane = value.lane if isinstance(value, Cells) else usual_lane(shape)
-    if lane is None or size == 0:
-        return first + np.arange(size).reshape(shape)
-    turned = [n for k, n in enumerate(shape) if k != lane] + [shape[lane]]
-    return np.moveaxis(first + np.arange(size).reshape(turned), -1, lane)
+def _block(
+    self: "Evaluation", value: Value, copies: int = 1
+) -> tuple[list[Block], np.ndarray]:
+    """New cells for an array, and who owns them.
+
+    The lanes of each number are neighbours. `copies` is the number of rows of such arrays.
+    """
+    shape, region = value.shape, self.graph.current
+    size, places = math.prod(shape), np.zeros(math.prod(shape), np.int64)
+    first = self.cellar.size
+    parts: list[np.ndarray] = []
+    if isinstance(value, Cells) and value.lane is not None:
+        turned = np.moveaxis(np.arange(size).reshape(shape), value.lane, -1)
+        parts = list(turned.reshape(-1, value.n))
+    elif isinstance(value, Memory):
+        found = self.cellar.columns(value.places.ravel())
+        parts = [] if found is None else [*found[0], *([found[1]] if found[1].size else [])]
+    if not parts:
+        lane = usual_lane(shape)
+        hint = self.rows_of.get(size) if len(shape) == 1 else None
+        if hint is not None:
+            parts = list(np.arange(size).reshape(hint).T)
+        elif lane is None:
+            parts = [np.arange(size)]
+        else:
+            turned = np.moveaxis(np.arange(size).reshape(shape), lane, -1)
+            parts = list(turned.reshape(-1, shape[lane]))
+    owners = []
+    whole = np.concatenate(parts)
+    places[whole] = first + np.arange(size)
+    if copies > 1:
+        sizes = {part.size for part in parts}
+        owners.append(Block(region, 0, sizes.pop() if len(sizes) == 1 else 1))
+        self.cellar.new(copies * size, owners[0])
+    else:
+        for part in parts:
+            owners.append(Block(region, 0, part.size))
+            self.cellar.new(part.size, owners[-1])
+    return owners, places.reshape(shape)
 
 
 def _same_through(jaxpr: Any, count: int, first: int, offset: int = 0) -> list[bool]:
@@ -199,15 +248,16 @@ class _Carry:
     def __init__(self, self_: "Evaluation", values: list[Value], same: list[bool]):
         self.evaluation = self_
         self.values, self.same = values, same
-        # The owner says in which region the cells are read; see `While`.
-        self.owner = Block(self_.graph.current, 0)
+        # The owners say in which region the cells are read; see `While`.
+        self.owners: list[Block] = []
         self.places = []
         for value, stays in zip(values, same, strict=True):
             if stays or math.prod(value.shape) == 0:
                 self.places.append(None)
                 continue
-            first = self_.cellar.new(math.prod(value.shape), self.owner)
-            self.places.append(_block_places(self_, value, value.shape, first))
+            owners, places = _block(self_, value)
+            self.owners += owners
+            self.places.append(places)
 
     def begin(self) -> list[Node]:
         """Writes the values before the loop."""
@@ -219,7 +269,8 @@ class _Carry:
         return out
 
     def read(self, region: Region) -> list[Value]:
-        self.owner.region, self.owner.ready = region, 0
+        for owner in self.owners:
+            owner.region, owner.ready = region, 0
         return [
             value if places is None else Memory(dtype_of(value), places)
             for value, places in zip(self.values, self.places, strict=True)
@@ -227,37 +278,39 @@ class _Carry:
 
     def commit(self, region: Region, results: list[Value]) -> None:
         """Writes the values after a pass, after all else in it."""
-        pairs = []
-        for value, places in zip(results, self.places, strict=True):
-            if places is not None:
-                pairs.append((self._prepared(value, places), places))
+        writes = [
+            self._prepared(value, places)
+            for value, places in zip(results, self.places, strict=True)
+            if places is not None
+        ]
         last = region.last_level() + 1
-        for value, places in pairs:
-            _stores(self.evaluation, value, places, region, last)
+        for write in writes:
+            write(region, last)
 
-    def _prepared(self, value: Value, places: np.ndarray) -> Value:
-        """The value with lanes that are not read from cells of the carry itself."""
-        lane = _lane(value)
-        if lane is None or isinstance(value, np.ndarray):
-            return value
-        cellar, graph = self.evaluation.cellar, self.evaluation.graph
-        dtype, n = dtype_of(value), value.shape[lane]
-        cells = cellar.laned(value, lane)
-        columns = np.moveaxis(places, lane, -1).reshape(-1, n)
+    def _prepared(self, value: Value, places: np.ndarray) -> Callable[[Region, int], None]:
+        """Writes a value from a level on, without lanes read from cells of the carry."""
+        evaluation = self.evaluation
+        graph, dtype = evaluation.graph, dtype_of(value)
+        numbers, cells = _numbers(evaluation, value, places)
+        pairs = []
+        for x, at in zip(numbers, cells, strict=True):
+            if isinstance(x, Node) and x.op == "load" and _is_in_place(evaluation, x, at):
+                continue
+            is_read = isinstance(x, Node) and (x.op in ("load", "dynamic") or not x.lanes)
+            if is_read and not isinstance(at, int):
+                x = graph.node("copy", dtype, (x,), lanes=len(at))
+            pairs.append((x, at))
 
-        def prepared(x: Number, at: np.ndarray) -> Number:
-            if not isinstance(x, Node) or (x.lanes and x.op not in ("load", "dynamic")):
-                return x
-            if x.op == "load" and _is_in_place(self.evaluation, x, at):
-                return x
-            return graph.node("copy", dtype, (x,), lanes=n)
+        def write(region: Region, level: int) -> None:
+            for x, at in pairs:
+                _store(evaluation, x, dtype, at, region, max(level, _level_of(x, region)))
 
-        flat = list(map(prepared, cells.ravel(), columns))
-        return Cells(dtype, objects(flat, cells.shape), lane, n)
+        return write
 
     def end(self, level: int) -> list[Value]:
         """The values after the loop."""
-        self.owner.region, self.owner.ready = self.evaluation.graph.current, level + 1
+        for owner in self.owners:
+            owner.region, owner.ready = self.evaluation.graph.current, level + 1
         return self.read_again()
 
     def read_again(self) -> list[Value]:
@@ -301,7 +354,7 @@ def _scan(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
     if length == 0:
         stacked = [np.zeros((0, *x.shape), x.dtype) for x in closed.out_avals[count:]]
         return [*carry, *stacked]
-    if length <= _UNROLLED:
+    if length == 1 or length * num_equations(closed.jaxpr) <= _WRITTEN_OUT:
         return _written_out(self, closed, consts, carry, rows, length, reverse)
     jaxpr, graph, cellar = closed.jaxpr, self.graph, self.cellar
     carry = _as_types(carry, closed.out_avals[:count])
@@ -339,24 +392,39 @@ def _scan(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
 
 
 class _Stack:
-    """What all passes of a loop return, row by row."""
+    """What all passes of a loop return.
+
+    The numbers of rows without lanes are stored as one lane for each pass, and rows with
+    lanes one after the other.
+    """
 
     def __init__(self, self_: "Evaluation", value: Value, length: int):
         self.evaluation, self.row, self.length = self_, value, length
-        self.size = math.prod(value.shape)
-        self.owner = Block(self_.graph.current, 0)
-        self.first = self_.cellar.new(length * self.size, self.owner)
-        self.places = _block_places(self_, value, value.shape, self.first)
+        size = math.prod(value.shape)
+        if size == 0:
+            return
+        numbers, _ = _numbers(self_, value, np.arange(size).reshape(value.shape))
+        if all(isinstance(x, Node) and x.lanes and not x.is_reduced for x in numbers):
+            self.stride = size
+            self.owners, self.places = _block(self_, value, length)
+        else:
+            self.stride = 1
+            self.owners = [Block(self_.graph.current, 0, length)]
+            first = self_.cellar.new(length * size, self.owners[0])
+            self.places = first + length * np.arange(size).reshape(value.shape)
 
     def write(self, region: Region, counter: Node) -> None:
-        _stores(self.evaluation, self.row, self.places, region, 0, counter, self.size)
+        if math.prod(self.row.shape):
+            evaluation = self.evaluation
+            _stores(evaluation, self.row, self.places, region, 0, counter, self.stride)
 
     def value(self, level: int) -> Value:
-        self.owner.region, self.owner.ready = self.evaluation.graph.current, level + 1
         dtype = dtype_of(self.row)
-        if self.size == 0:
+        if math.prod(self.row.shape) == 0:
             return np.zeros((self.length, *self.row.shape), dtype)
-        rows = self.size * np.arange(self.length).reshape(-1, *[1] * self.places.ndim)
+        for owner in self.owners:
+            owner.region, owner.ready = self.evaluation.graph.current, level + 1
+        rows = self.stride * np.arange(self.length).reshape(-1, *[1] * self.places.ndim)
         return Memory(dtype, rows + self.places)
 
 
@@ -477,7 +545,7 @@ def _cond(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
     for region, branch in zip(regions, branches, strict=True):
         with _within(self, region):
             outs.append(_as_types(self.closed(branch, operands), branch.out_avals))
-    owner = Block(graph.current, 0)
+    owners: list[Block] = []
     results: list[Value] = []
     for k, aval in enumerate(branches[0].out_avals):
         of_branch = [out[k] for out in outs]
@@ -485,15 +553,16 @@ def _cond(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
             results.append(of_branch[0])
             continue
         dtype = type_name(aval.dtype)
-        first = self.cellar.new(aval.size, owner)
         like = next((x for x in of_branch if isinstance(x, Cells)), of_branch[0])
-        places = _block_places(self, like, aval.shape, first)
+        own, places = _block(self, like)
+        owners += own
         for region, value in zip(regions, of_branch, strict=True):
             with _within(self, region):
                 _stores(self, value, places, region, 0)
         results.append(Memory(dtype, places))
     _finish(self, item, [marker])
-    owner.region, owner.ready = graph.current, item.level + 1
+    for owner in owners:
+        owner.region, owner.ready = graph.current, item.level + 1
     return results
 
 

@@ -71,10 +71,13 @@ _TYPES = frozenset("f8 f4 i8 i4 i2 i1 u8 u4 u2 u1 b1".split())
 
 
 class Block:
-    """Cells that are written as a whole, by loops; they can be read from a level on."""
+    """Cells that are written as a whole, by loops; they can be read from a level on.
 
-    def __init__(self, region: Region, ready: int):
-        self.region, self.ready = region, ready
+    - `lanes`: the number of neighbouring cells that are lanes of one number.
+    """
+
+    def __init__(self, region: Region, ready: int, lanes: int = 1):
+        self.region, self.ready, self.lanes = region, ready, lanes
 
 
 class Cellar:
@@ -89,6 +92,7 @@ class Cellar:
         self.num_constants = 0
         self._constant_starts: list[int] = []
         self._constant_places: dict[Any, int] = {}
+        self._arrays = np.zeros(0, np.int64), np.zeros(0, np.int64)
         # Tables of places that kernels read while they run.
         self.tables: list[np.ndarray] = []
         self._table_numbers: dict[bytes, int] = {}
@@ -101,6 +105,17 @@ class Cellar:
         self._owners.append(owner)
         self.size += count
         return self._starts[-1]
+
+    def scattered(self, places: np.ndarray) -> tuple[int | None, int, int]:
+        """Cells as a first one and a table of distances, which other columns share.
+
+        The distance between constants and other cells is not known yet: with both, there
+        is no first one.
+        """
+        is_constant = places >= CONSTANTS
+        if np.any(is_constant != is_constant[0]):
+            return None, 0, self.table(places)
+        return int(places[0]), 0, self.table(places - places[0])
 
     def table(self, places: np.ndarray) -> int:
         """The number of a table."""
@@ -135,7 +150,7 @@ class Cellar:
     def loaded_places(self, x: Node) -> np.ndarray:
         first, stride, table = x.extra
         if table is not None:
-            return self.tables[table]
+            return (first or 0) + self.tables[table]
         return first + stride * np.arange(x.lanes)
 
     def _new_constants(self, cells: np.ndarray) -> int:
@@ -205,7 +220,9 @@ class Cellar:
                 if owner.place == first and owner.lanes == n and not owner.is_reduced:
                     return owner
         region, level, markers = self._readable(owners)
-        extra = (first, stride, None) if is_affine else (0, 0, self.table(places))
+        extra = (first, stride, None)
+        if not is_affine:
+            extra = self.scattered(places)
         return self.graph.at(region, level, "load", dtype, markers, extra, n)
 
     def readable(self, places: np.ndarray) -> tuple[Region, int, tuple[Node, ...]]:
@@ -233,6 +250,57 @@ class Cellar:
 
     def marker(self, region: Region, level: int) -> Node:
         return self.graph.at(region, level, "marker", "b1", extra=level)
+
+    def columns(self, places: np.ndarray) -> tuple[list[np.ndarray], np.ndarray] | None:
+        """The entries of an array by the columns that they are.
+
+        A column is a number of many lanes, of which the array has all. Returned are the
+        entries of each, in the order of the lanes, and the other entries; `None` if these
+        are most of them.
+        """
+        is_constant = places >= CONSTANTS
+        safe = np.where(is_constant, 0, places)
+        starts = self._start_array()
+        owner = np.searchsorted(starts, safe, side="right") - 1
+        lanes = self._lane_array()[owner]
+        offset = safe - starts[owner]
+        column = np.where(lanes >= _FEWEST_LANES, starts[owner] + offset - offset % lanes, -1)
+        column[is_constant] = -1
+        order = np.lexsort((places, column))
+        sorted_columns = column[order]
+        cuts = np.flatnonzero(np.diff(sorted_columns)) + 1
+        whole, rest = [], []
+        for part in np.split(order, cuts):
+            at = places[part]
+            is_whole = (
+                column[part[0]] >= 0
+                and part.size == lanes[part[0]]
+                and at[0] == column[part[0]]
+                and at[-1] == at[0] + part.size - 1
+            )
+            (whole if is_whole else rest).append(part)
+        others = np.sort(np.concatenate(rest)) if rest else np.zeros(0, int)
+        if 2 * others.size > places.size:
+            return None
+        return whole, others
+
+    def _start_array(self) -> np.ndarray:
+        self._refresh()
+        return self._arrays[0]
+
+    def _lane_array(self) -> np.ndarray:
+        return self._arrays[1]
+
+    def _refresh(self) -> None:
+        """The owners as arrays, which are made anew after some more have come."""
+        if self._arrays[0].size != len(self._starts):
+            known = self._arrays[0].size
+            new = self._owners[known:]
+            lanes = [1 if getattr(x, "is_reduced", False) else x.lanes or 1 for x in new]
+            self._arrays = (
+                np.append(self._arrays[0], self._starts[known:]).astype(np.int64),
+                np.append(self._arrays[1], lanes).astype(np.int64),
+            )
 
     def _all_owners(self, places: np.ndarray) -> list[Node | Block]:
         places = places[places < CONSTANTS]
