@@ -126,6 +126,9 @@ ELEMENTWISE: dict[str, Rule] = {
     "round": _round,
     "rsqrt": _rsqrt,
     "select_n": _select,
+    "shift_left": _plain("shl"),
+    "shift_right_arithmetic": _plain("ashr"),
+    "shift_right_logical": _plain("lshr"),
     "sign": _sign,
     "square": _square,
 }

@@ -54,7 +54,10 @@ _SAME = frozenset(
 class Evaluation:
     """Evaluates programs in the current region of a graph."""
 
-    def __init__(self, rows_of: dict[int, tuple[int, int]] | None = None):
+    def __init__(
+        self, rows_of: dict[int, tuple[int, int]] | None = None, may_be_wide: bool = True
+    ):
+        self.may_be_wide = may_be_wide
         self.graph = Graph()
         self.cellar = Cellar(self.graph)
         # The rows in which vectors of some lengths are read.

@@ -19,11 +19,23 @@ class Region:
 
     - `floor`: the outermost region to which operations are moved that do not depend on
       anything in this one. A branch keeps its operations: it may not be taken.
+    - `is_wide`: whether it is run for several passes of a loop at a time.
+    - `mask`: the cell that tells which of these passes are active; `None` if all are.
     - `nodes`, `items`: its operations, and its loops and branches.
     """
 
-    def __init__(self, parent: "Region | None" = None, is_branch: bool = False):
+    def __init__(
+        self,
+        parent: "Region | None" = None,
+        is_branch: bool = False,
+        is_wide: bool = False,
+        mask: int | None = None,
+    ):
         self.parent = parent
+        self.is_wide: bool = is_wide or (parent is not None and parent.is_wide)
+        self.mask: int | None = mask
+        if mask is None and parent is not None:
+            self.mask = parent.mask
         self.depth: int = 0 if parent is None else parent.depth + 1
         self.floor: Region = self if parent is None or is_branch else parent.floor
         self.nodes: list[Node] = []
@@ -202,10 +214,21 @@ def _div(a: Any, b: Any) -> Any:
     return np.divide(a, b)
 
 
-def _fold_shift(a: int, b: int) -> int:
-    return a << b
+def _shift_left(a: Any, b: Any, size: int) -> Any:
+    return np.left_shift(a, b) if 0 <= b < size else a.dtype.type(0)
 
 
+def _shift_right(a: Any, b: Any, size: int) -> Any:
+    bits = a.view(f"u{size // 8}")
+    shifted = bits >> bits.dtype.type(b) if 0 <= b < size else bits.dtype.type(0)
+    return np.asarray(shifted).view(a.dtype)
+
+
+def _shift_right_signed(a: Any, b: Any, size: int) -> Any:
+    return np.right_shift(a, np.clip(b, 0, size - 1))
+
+
+_SHIFTS = {"shl": _shift_left, "lshr": _shift_right, "ashr": _shift_right_signed}
 _COMPARE: dict[str, Callable[[Any, Any], Any]] = {
     "eq": lambda a, b: a == b,
     "ne": lambda a, b: a != b,
@@ -275,8 +298,10 @@ def _folded(op: str, dtype: str, operands: tuple[Any, ...], extra: Any) -> Numbe
         if op == "call":
             values = (np.asarray(x, dtype) for x in operands)
             return as_number(_CALLS[extra](*values), dtype)
-        if op in ("shl", "shr", "sar"):
-            raise NotImplementedError
+        if op in _SHIFTS:
+            kind = np.dtype(dtype)
+            size = 8 * kind.itemsize
+            return as_number(_SHIFTS[op](*(np.array(x, kind) for x in operands), size), dtype)
         return as_number(_FOLD[op](*operands), dtype)
 
 

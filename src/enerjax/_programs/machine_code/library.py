@@ -12,7 +12,8 @@ import numpy as np
 
 from .emission import Emission
 from .evaluation import Evaluation, rows_of_vectors
-from .values import Block, CONSTANTS, dtype_of, Memory, type_name, Value
+from .loops import WIDTH
+from .values import Block, CONSTANTS, dtype_of, Memory, NotWideError, type_name, Value
 
 
 _CODES = {"f8": "double", "f4": "float", "b1": "i8"} | {
@@ -38,7 +39,16 @@ def compiled_function(
 
     Raises `Unsupported`.
     """
-    evaluation = Evaluation(rows_of_vectors(jaxpr))
+    try:
+        return _compiled(jaxpr, known, True)
+    except NotWideError:
+        return _compiled(jaxpr, known, False)
+
+
+def _compiled(
+    jaxpr: Any, known: Sequence[np.ndarray | None], may_be_wide: bool
+) -> Function:
+    evaluation = Evaluation(rows_of_vectors(jaxpr), may_be_wide)
     cellar = evaluation.cellar
     variables = [*jaxpr.constvars, *jaxpr.invars]
     values: list[Value] = []
@@ -72,7 +82,7 @@ def compiled_function(
 
 def _function(emission: Emission, inputs: list, outputs: list) -> Function:
     cellar = emission.cellar
-    main = emission.main()
+    main = emission.main
     copies = _copies(emission, inputs, outputs)
     constants = np.concatenate([np.zeros(0, np.int64), *cellar.constants])
     # Tables of distances have no constants' cells.
@@ -81,6 +91,8 @@ def _function(emission: Emission, inputs: list, outputs: list) -> Function:
     ]
     size = 8 * (cellar.num_constants + cellar.size)
     handler = _HANDLER.replace("$SIZE$", str(max(size, 8)))
+    handler = handler.replace("$WIDE$", str(max(WIDTH * size, 8) if emission.has_passes else 8))
+    handler = handler.replace("$NUMBER$", str(constants.size * emission.has_passes))
     handler = handler.replace("$CONSTANTS$", str(8 * constants.size))
     handler = handler.replace("$COPIES_IN$", copies[0]).replace("$COPIES_OUT$", copies[1])
     text = "\n".join([
@@ -89,6 +101,8 @@ def _function(emission: Emission, inputs: list, outputs: list) -> Function:
         main,
         _helpers(),
         handler,
+        _widened(),
+        "attributes #3 = { nounwind optnone noinline }",
         'attributes #0 = { nounwind noinline "no-trapping-math"="true" }',
         "attributes #2 = { nounwind noinline optnone }",
         "attributes #1 = { nounwind willreturn memory(none) }",
@@ -193,6 +207,31 @@ def _helpers() -> str:
     return "\n".join(out)
 
 
+def _widened() -> str:
+    """A function that copies constants, once for each pass that is made at a time."""
+    vector = f"<{WIDTH} x double>"
+    return f"""define internal void @widened(ptr %m, ptr %w, i64 %n) #0 {{
+entry:
+  br label %head
+head:
+  %k = phi i64 [ 0, %entry ], [ %next, %body ]
+  %more = icmp ult i64 %k, %n
+  br i1 %more, label %body, label %end
+body:
+  %a = getelementptr double, ptr %m, i64 %k
+  %x = load double, ptr %a
+  %one = insertelement {vector} poison, double %x, i64 0
+  %all = shufflevector {vector} %one, {vector} poison, <{WIDTH} x i32> zeroinitializer
+  %b = getelementptr {vector}, ptr %w, i64 %k
+  store {vector} %all, ptr %b, align 8
+  %next = add i64 %k, 1
+  br label %head
+end:
+  ret void
+}}
+"""
+
+
 # The function that XLA calls, by the interface of `xla/ffi/api/c_api.h`: the offsets are
 # those of its structures. In a first call it is asked for the version of the interface, and
 # answers with the one that it is called by.
@@ -219,14 +258,17 @@ answer:
 work:
   %m = call ptr @malloc(i64 $SIZE$)
   call void @llvm.memcpy.p0.p0.i64(ptr %m, ptr inttoptr (i64 $C$ to ptr), i64 $CONSTANTS$, i1 false)
+  %w = call ptr @malloc(i64 $WIDE$)
+  call void @widened(ptr %m, ptr %w, i64 $NUMBER$)
   %f0 = getelementptr i8, ptr %frame, i64 72
   %args = load ptr, ptr %f0
   %f1 = getelementptr i8, ptr %frame, i64 112
   %rets = load ptr, ptr %f1
 $COPIES_IN$
-  call void @main(ptr %m)
+  call void @main(ptr %m, ptr %w)
 $COPIES_OUT$
   call void @free(ptr %m)
+  call void @free(ptr %w)
   ret ptr null
 }
 """

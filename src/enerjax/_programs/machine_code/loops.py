@@ -32,15 +32,23 @@ if TYPE_CHECKING:
     from .evaluation import Evaluation
 
 
+# The number of passes that are made at a time, if they do not depend on one another.
+WIDTH = 4
 # Loops with no more operations than this in all passes are written out.
 _WRITTEN_OUT = 150
 
 
 class Scan:
-    """`length` passes of a body; `counter` is the cell that has the number of the pass."""
+    """`length` passes of a body; `counter` is the cell that has the number of the pass.
 
-    def __init__(self, body: Region, length: int, reverse: bool, counter: int):
+    With `is_wide` several passes are made at a time.
+    """
+
+    def __init__(
+        self, body: Region, length: int, reverse: bool, counter: int, is_wide: bool
+    ):
         self.body, self.length, self.reverse = body, length, reverse
+        self.is_wide = is_wide
         self.counter = counter
         self.level = 0
 
@@ -56,9 +64,8 @@ class While:
     - `before`: what the body needs and does not change; runs once if there is a pass.
     """
 
-    def __init__(self, head: Region, before: Region, body: Region):
-        self.head, self.before, self.body = head, before, body
-        self.flag = 0
+    def __init__(self, head: Region, before: Region, body: Region, flag: int):
+        self.head, self.before, self.body, self.flag = head, before, body, flag
         self.level = 0
 
     @property
@@ -115,11 +122,15 @@ def _store(
     level: int,
     counter: Node | None = None,
     stride: int = 0,
+    mask: int | None = None,
 ) -> Node:
-    """Writes a number, or one for each lane, to cells of its own."""
+    """Writes a number, or one for each lane, to cells of its own.
+
+    Where several passes are made at a time, only those of the mask write.
+    """
     operands = (x,) if counter is None else (x, counter)
     if isinstance(places, int):
-        extra, lanes = (places, 0, None, stride), 0
+        extra, lanes = (places, 0, None, stride, mask), 0
     else:
         steps = np.diff(places)
         affine = steps.size == 0 or bool(np.all(steps == steps[0]))
@@ -127,7 +138,7 @@ def _store(
         first, step, table = (
             (int(places[0]), step, None) if affine else self.cellar.scattered(places)
         )
-        extra = first, step, table, stride
+        extra = first, step, table, stride, mask
     return self.graph.at(region, level, "store", dtype, operands, extra, lanes)
 
 
@@ -139,6 +150,7 @@ def _stores(
     level: int,
     counter: Node | None = None,
     stride: int = 0,
+    mask: int | None = None,
 ) -> list[Node]:
     """Writes an array to cells."""
     if math.prod(value.shape) == 0:
@@ -153,7 +165,7 @@ def _stores(
         now = level
         if isinstance(x, Node) and x.region is region:
             now = max(now, x.level + 1 if x.is_reduced else x.level)
-        out.append(_store(self, x, dtype, at, region, now, counter, stride))
+        out.append(_store(self, x, dtype, at, region, now, counter, stride, mask))
     return out
 
 
@@ -276,10 +288,12 @@ class _Carry:
             for value, places in zip(self.values, self.places, strict=True)
         ]
 
-    def commit(self, region: Region, results: list[Value]) -> None:
+    def commit(
+        self, region: Region, results: list[Value], mask: int | None = None
+    ) -> None:
         """Writes the values after a pass, after all else in it."""
         writes = [
-            self._prepared(value, places)
+            self._prepared(value, places, mask)
             for value, places in zip(results, self.places, strict=True)
             if places is not None
         ]
@@ -287,7 +301,9 @@ class _Carry:
         for write in writes:
             write(region, last)
 
-    def _prepared(self, value: Value, places: np.ndarray) -> Callable[[Region, int], None]:
+    def _prepared(
+        self, value: Value, places: np.ndarray, mask: int | None
+    ) -> Callable[[Region, int], None]:
         """Writes a value from a level on, without lanes read from cells of the carry."""
         evaluation = self.evaluation
         graph, dtype = evaluation.graph, dtype_of(value)
@@ -303,7 +319,8 @@ class _Carry:
 
         def write(region: Region, level: int) -> None:
             for x, at in pairs:
-                _store(evaluation, x, dtype, at, region, max(level, _level_of(x, region)))
+                at_least = max(level, _level_of(x, region))
+                _store(evaluation, x, dtype, at, region, at_least, mask=mask)
 
         return write
 
@@ -358,10 +375,11 @@ def _scan(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
         return _written_out(self, closed, consts, carry, rows, length, reverse)
     jaxpr, graph, cellar = closed.jaxpr, self.graph, self.cellar
     carry = _as_types(carry, closed.out_avals[:count])
-    body = Region(graph.current)
-    counter_owner = Block(body, 0)
-    counter_place = cellar.new(1, counter_owner)
-    item = Scan(body, length, reverse, counter_place)
+    is_wide = self.may_be_wide and graph.current is graph.root
+    is_wide = is_wide and count == 0 and length >= WIDTH
+    body = Region(graph.current, is_wide=is_wide)
+    counter_place = cellar.new(1, Block(body, 0))
+    item = Scan(body, length, reverse, counter_place, is_wide)
     cells = _Carry(self, carry, _same_through(jaxpr, count, first))
     written = cells.begin()
     rows = [_rows_in_order(self, x) for x in rows]
@@ -501,21 +519,25 @@ def _while(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
     outer, inner = values[:first], values[first : first + second]
     closed = params["body_jaxpr"]
     carry = _as_types(values[first + second :], closed.out_avals)
-    head = Region(graph.current)
-    before = Region(graph.current, is_branch=True)
+    owner = Block(graph.current, 0)
+    flag_place = self.cellar.new(1, owner)
+    head = Region(graph.current, mask=flag_place)
+    before = Region(graph.current, is_branch=True, mask=flag_place)
     body = Region(before)
-    item = While(head, before, body)
+    item = While(head, before, body, flag_place)
     count = len(carry)
     cells = _Carry(self, carry, _same_through(closed.jaxpr, count, second))
     written = cells.begin()
     with _within(self, head):
         (goes_on,) = self.closed(params["cond_jaxpr"], [*outer, *cells.read(head)])
         (flag,) = self.cellar.unlaned(goes_on).ravel()
-        item.flag = self.cellar.new(1, Block(head, 0))
-        _store(self, flag, "b1", item.flag, head, _level_of(flag, head))
+        owner.region = head
+        # Where several passes are made at a time, one that has ended does not begin again.
+        level = _level_of(flag, head)
+        _store(self, flag, "b1", flag_place, head, level, mask=flag_place)
     with _within(self, body):
         outs = self.closed(closed, [*inner, *cells.read(body)])
-        cells.commit(body, _as_types(outs, closed.out_avals))
+        cells.commit(body, _as_types(outs, closed.out_avals), flag_place)
     _finish(self, item, written)
     return cells.end(item.level)
 
@@ -538,7 +560,14 @@ def _cond(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
     which = graph.op("max", "i8", (which, 0))
     which = graph.op("min", "i8", (which, len(branches) - 1))
     assert isinstance(which, Node)
-    regions = [Region(graph.current, is_branch=True) for _ in branches]
+    regions = [
+        Region(
+            graph.current,
+            is_branch=True,
+            mask=self.cellar.new(1, Block(graph.current, 0)),
+        )
+        for _ in branches
+    ]
     item = Branch(regions, self.cellar.place_of(which, "i8"))
     marker = self.cellar.marker(which.region, _level_of(which, which.region))
     outs = []
@@ -558,7 +587,7 @@ def _cond(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
         owners += own
         for region, value in zip(regions, of_branch, strict=True):
             with _within(self, region):
-                _stores(self, value, places, region, 0)
+                _stores(self, value, places, region, 0, mask=region.mask)
         results.append(Memory(dtype, places))
     _finish(self, item, [marker])
     for owner in owners:

@@ -30,6 +30,10 @@ class Unsupported(Exception):
     """A program that is not compiled here: the reason in words, and the operation."""
 
 
+class NotWideError(Exception):
+    """Passes of a loop that cannot be made several at a time."""
+
+
 class Cells:
     def __init__(self, dtype: str, cells: np.ndarray, lane: int | None = None, n: int = 1):
         self.dtype, self.cells, self.lane, self.n = dtype, cells, lane, n
@@ -60,10 +64,12 @@ def dtype_of(value: Any) -> str:
 
 def type_name(dtype: Any) -> str:
     """The name of a type of numbers, such as `"f8"`."""
-    dtype = np.dtype(dtype)
-    name = dtype.str[1:]
+    try:
+        name = np.dtype(dtype).str[1:]
+    except TypeError:  # random keys
+        name = str(dtype)
     if name not in _TYPES:
-        raise Unsupported(f"numbers of type {dtype}")
+        raise Unsupported(f"numbers of type `{dtype}`")
     return name
 
 
@@ -186,6 +192,10 @@ class Cellar:
         moved = np.delete(np.array(cells.shape), value.lane)
         stacked = np.array(columns, np.int64).reshape(*moved, value.n)
         return np.moveaxis(stacked, -1, value.lane)
+
+    def is_wide(self, place: int) -> bool:
+        """Whether a cell has a number for each pass that is made at a time."""
+        return place < CONSTANTS and self._owner(place).region.is_wide
 
     # What is read -------------------------------------------------------------------------
 
