@@ -76,13 +76,6 @@ class AbstractModel(eqx.Module):
     # The index tables of `delassus_matrix`; `None` where there is none, or no joints.
     constraint_tables: eqx.AbstractVar[SchurTables | None]
 
-    @abc.abstractmethod
-    def with_known_zeros(self, state: State) -> "AbstractModel":
-        """The model, with known numbers in place of what is zero in every inertia.
-
-        `state` is any state of the model.
-        """
-
     @property
     @abc.abstractmethod
     def has_own_momenta(self) -> bool:

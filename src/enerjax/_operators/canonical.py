@@ -43,9 +43,6 @@ class CanonicalModel(AbstractModel):
         self.scales = self._scales(state)
         self.constraint_tables = self._tables(state)
 
-    def with_known_zeros(self, state: State) -> "CanonicalModel":
-        # The inertia is a function of the coordinates, evaluated where it is needed.
-        return self
 
     @property
     def has_own_momenta(self) -> bool:

@@ -26,7 +26,6 @@ from .._discrete import (
     ChainRule,
     RotationRule,
 )
-from .._programs import known_zeros
 from .._solvers import (
     affine_root,
     as_dense,
@@ -117,23 +116,6 @@ class SeparableModel(AbstractModel):
         self.scales = self._scales(state)
         self.constraint_tables = self._constraint_tables(state)
 
-    def with_known_zeros(self, state: State) -> "SeparableModel":
-        system, kind, args = self.system, self.kinematics, self.args
-        user = kind.user_velocity(state.q, state.v)
-        inertia = lambda: kind.inertia(
-            lambda: system.inertia(State(state.q, user), args),
-            lambda v: system.kinetic_energy(State(state.q, v), args),
-            state.q.dtype,
-        )
-        kept = jax.tree.map(np.invert, known_zeros(inertia))
-        # The inverse has its zeros between coordinates that are not coupled.
-        coupled = jax.tree.map(_connected, kept)
-        only = lambda x, kept: jax.tree.map(lambda x, on: jnp.where(on, x, 0), x, kept)
-        return eqx.tree_at(
-            lambda model: (model.inertia, model.inverse_inertia),
-            self,
-            (only(self.inertia, kept), only(self.inverse_inertia, coupled)),
-        )
 
     @property
     def has_own_momenta(self) -> bool:
@@ -549,11 +531,3 @@ class SeparableModel(AbstractModel):
         """`dpsi/dt` of a motion with constant velocities `v`."""
         rates = lambda q, t: self.joint_rate(q, state.v, t)
         return jax.jvp(rates, (state.q, state.t), (qdot, time_rate(state.t)))[1]
-
-
-def _connected(coupled: Bool[np.ndarray, "*blocks n n"]) -> Bool[np.ndarray, "*blocks n n"]:
-    """Which rows and columns of (blocks of) a matrix are coupled through others."""
-    reached = coupled.astype(int)
-    for _ in range(coupled.shape[-1].bit_length()):
-        reached = np.minimum(reached @ reached, 1)
-    return reached > 0

@@ -13,7 +13,6 @@ from .compiled import (
 )
 from .counting import num_operations as num_operations
 from .digest import checksum as checksum, digest as digest
-from .entrywise import known_zeros as known_zeros
 from .fast_loops import enable_fast_loops as enable_fast_loops
 from .hashable_indices import Indices as Indices
 from .jaxprs import (
@@ -25,16 +24,11 @@ from .jaxprs import (
     programs_within as programs_within,
     wrapped_program as wrapped_program,
 )
-from .one_function.api import (
+from .machine_code import (
     in_one_function as in_one_function,
     part as part,
-    run_side_by_side as run_side_by_side,
-    SideBySide as SideBySide,
-    unmerged as unmerged,
+    why_not_one_function as why_not_one_function,
 )
-from .one_function.obstacles import why_not_one_function as why_not_one_function
-from .one_function.possible import LARGEST_SUM as LARGEST_SUM
-from .one_function.products import plain_products as plain_products, summed as summed
 from .places import at_places as at_places, with_any as with_any
 from .simplification import simplified as simplified
 from .sparsity.jacobian_columns import (

@@ -72,6 +72,9 @@ PLACES_OF_EXTREMES = _names("argmax argmin")
 CUMULATIVE = _names("cummax cummin cumprod cumsum")
 CONTRACTION = "dot_general"
 
+# Sorting, and factors of matrices.
+FACTORS = _names("cholesky lu lu_pivots_to_permutation sort triangular_solve")
+
 # Programs within --------------------------------------------------------------------------
 
 # `jax.jit`, under the names that it has in the supported versions of JAX.
@@ -84,8 +87,6 @@ CALLS = {
     **dict.fromkeys(WITH_OWN_DERIVATIVE, "call_jaxpr"),
     **dict.fromkeys(_names("closed_call core_call"), "call_jaxpr"),
 }
-# Wrappers that exist only in versions of JAX without the marks of one function.
-CALLS_OF_OTHER_VERSIONS = _names("checkpoint core_call pjit")
 # A linear solve, with programs for the products and the solutions of both directions.
 LINEAR_SOLVE = "custom_linear_solve"
 # Loops and branches.

@@ -1,6 +1,5 @@
 """The loop over the steps of a run."""
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -12,16 +11,15 @@ from jaxtyping import Array, PyTree
 
 from .._operators import AbstractModel
 from .._programs import in_any_lane
-from .._results import first_failure, may_need_newton, RESULTS
+from .._results import first_failure, RESULTS
 from .._solvers import ChordAlone, Newton, RootFinder
 from .._system import State
 from .._types import Count, Flag, Multipliers, Scalar
 from ..schemes import AbstractScheme, AbstractSchemeWithChord, Energies
 from .event_search import Found, no_search, settle, Watch
 from .halving import select
-from .reverse import keep_roots, LoopBody, loops
+from .reverse import keep_roots, loops
 from .saving import Begin, Costs, Record, with_time
-from .stage import has_chord, num_unknowns
 from .step import advance, first_warm, model_for, StepOutput, Warm
 from .step_sizes import AbstractPlan, EqualPlan, Verdict
 from .watcher import Happening, Watcher
@@ -46,7 +44,7 @@ class Progress(eqx.Module):
 
 
 class Stepper(eqx.Module):
-    """What all steps of a run have in common; for `may_have_lanes` see `Task`."""
+    """What all steps of a run have in common."""
 
     scheme: AbstractScheme
     model: AbstractModel
@@ -54,7 +52,6 @@ class Stepper(eqx.Module):
     root_finder: RootFinder | ChordAlone
     max_halvings: int | None = eqx.field(static=True)
     watcher: Watcher | None = None
-    may_have_lanes: bool = eqx.field(static=True, default=True)
 
     def model_at(self, progress: Progress) -> AbstractModel:
         """The model that events have left."""
@@ -345,31 +342,19 @@ def run_loop(
         return keep_roots(attempt)(progress, live)
 
     def one_group(stepper: Stepper, before: Progress, live: Flag):
-        step = loop_body(stepper, one_step)
+        step = functools.partial(one_step, stepper)
         after, attempts = over_steps(step, before, steps_in_group, live)
         kept = keep(stepper.model_at(after))(after.state, after.place)
         return after, _record_of(after, attempts, kept)
 
     begin = stepper.begin(start)
-    stepper_for_lanes = for_lanes(stepper, begin)
-    if_long = _num_unknowns(begin) > _FEW_IN_LANES
-
-    def loop_body(own: Stepper, fn: Callable) -> LoopBody:
-        in_turn, make = functools.partial(fn, own), stepper_for_lanes
-        # Within a loop of lanes side by side, all loops are for them.
-        if make is None or own is not stepper:
-            return LoopBody(in_turn, None, search_fails, if_long)
-        side_by_side = lambda *inputs: fn(make(), *inputs)
-        return LoopBody(in_turn, side_by_side, search_fails, if_long)
-
     kept = Begin(
         kept=keep(stepper.model_at(begin))(begin.state, begin.place),
         multipliers=begin.multipliers,
         varying=begin.varying,
     )
-    end, record = over_groups(
-        loop_body(stepper, one_group), begin, num_groups, jnp.array(True)
-    )
+    group = functools.partial(one_group, stepper)
+    end, record = over_groups(group, begin, num_groups, jnp.array(True))
     is_whole_run = end.place >= plan.last
     if end.watch is not None:
         is_whole_run = is_whole_run | end.watch.ended
@@ -411,46 +396,6 @@ def dispensable_newton(
     ):
         return None
     return root_finder
-
-
-# The largest number of unknowns of a step that is computed for many lanes side by side,
-# and the same if a single run is one function. A chain of 8 points, with 32 unknowns, takes
-# a quarter longer side by side; two hinged bodies, which are too long for one function,
-# take two thirds of the time.
-_MANY_IN_LANES, _FEW_IN_LANES = 40, 16
-
-
-def for_lanes(stepper: Stepper, begin: Progress) -> Callable[[], Stepper] | None:
-    """The steps for lanes of a batch side by side, which have no exact Jacobian.
-
-    Lanes whose steps need it are computed again with it.
-    """
-    model = stepper.model
-    newton = dispensable_newton(
-        stepper.root_finder, stepper.scheme, stepper.plan, stepper.watcher
-    )
-    if (
-        newton is None
-        or not stepper.may_have_lanes
-        or not has_chord(stepper.scheme.stage, model)
-        or _num_unknowns(begin) > _MANY_IN_LANES
-    ):
-        return None
-    # The zeros must become known where the steps are traced.
-    return lambda: dataclasses.replace(
-        stepper,
-        model=model.with_known_zeros(begin.state),
-        root_finder=ChordAlone(newton, above=0),
-    )
-
-
-def _num_unknowns(begin: Progress) -> int:
-    return num_unknowns(jax.tree.map(lambda x: x[0], begin.warm.stages))
-
-
-def search_fails(before: Progress, after: Progress) -> Flag:
-    """Whether a step between two states has failed, perhaps for want of Newton's method."""
-    return (before.result == RESULTS.successful) & may_need_newton(after.result)
 
 
 def _check_start(

@@ -9,44 +9,25 @@ and repeat Newton's method, so that their memory grows like `sqrt(n)`.
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._programs import in_any_lane, in_one_function, SideBySide
+from .._programs import in_any_lane, in_one_function
 from .._solvers import ROOT
 from .._types import Flag
 
 
 # With more steps than this the roots are not kept.
 LONG = 10_000
-# The fewest lanes of a batch, and steps of all its lanes together, for which the program
-# for lanes side by side is made: it takes seconds to compile.
-_FEWEST_LANES, _FEWEST_STEPS = 64, 20_000
 
 Body: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]
 
 
-class LoopBody(NamedTuple):
-    """What one pass of a loop computes, for one run and for the lanes of a batch.
-
-    - `in_turn`: for a single run, and for lanes that run one after the other.
-    - `side_by_side`: for lanes side by side; `None` if there is no such program.
-    - `has_failed(before, after)`: whether `side_by_side` has failed in the passes between
-      two carries.
-    - `if_long`: see `SideBySide`.
-    """
-
-    in_turn: Body
-    side_by_side: Body | None
-    has_failed: Callable[[Any, Any], Flag]
-    if_long: bool
-
-
 # `scan(body, carry, count, live)` makes `count` passes from `(carry, live)`.
-Scan: TypeAlias = Callable[[LoopBody, Any, int, Flag], tuple[Any, Any]]
+Scan: TypeAlias = Callable[[Body, Any, int, Flag], tuple[Any, Any]]
 
 
 # XLA cannot merge a recomputation with the original across the passes of a loop.
@@ -75,15 +56,15 @@ def loops(
     return in_segments, _scan
 
 
-def _scan(body: LoopBody, carry: Any, count: int, live: Flag) -> tuple[Any, Any]:
-    one_pass = lambda carry, _: body.in_turn(carry, live)
+def _scan(body: Body, carry: Any, count: int, live: Flag) -> tuple[Any, Any]:
+    one_pass = lambda carry, _: body(carry, live)
     return jax.lax.scan(one_pass, carry, None, length=count)
 
 
 def _in_segments(
     total: int,
     length: int,
-    body: LoopBody,
+    body: Body,
     carry: Any,
     count: int,
     live: Flag,
@@ -104,18 +85,8 @@ def _in_segments(
         one_pass = lambda carry, k: fn(carry, live & (first + k < count))
         return jax.lax.scan(one_pass, carry, jnp.arange(size))
 
-    lanes, for_lanes = None, body.side_by_side
-    if for_lanes is not None:
-
-        def side_by_side(carry: Any, inputs: tuple[Array, Flag]) -> tuple[Any, Flag]:
-            out = passes(for_lanes, carry, inputs)
-            return out, body.has_failed(carry, out[0])
-
-        fewest = max(_FEWEST_LANES, -(-_FEWEST_STEPS // total))
-        lanes = SideBySide(side_by_side, fewest, body.if_long)
-
-    whole = functools.partial(passes, body.in_turn)
-    segment = in_one_function(keep_roots(whole), lanes)
+    whole = functools.partial(passes, body)
+    segment = in_one_function(keep_roots(whole))
     if total > LONG:
         segment = _checkpoint(segment)
     if done is not None:

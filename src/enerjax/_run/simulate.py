@@ -188,7 +188,6 @@ def _whole(task: Task, num_rows: int) -> tuple[Solution, _Outcome]:
     quick = None
     values = values_of(task)
     if at_top_level(values):
-        task = dataclasses.replace(task, may_have_lanes=False)
         if task.watcher is None and is_known(task):
             task = dataclasses.replace(task, plan=task.plan.rounded_up())
         quick = chord_alone(task, values)

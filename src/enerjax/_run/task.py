@@ -24,10 +24,7 @@ from .watcher import Watcher
 
 
 class Task(eqx.Module):
-    """The checked arguments of `simulate`.
-
-    - `may_have_lanes`: whether the run may become a batch of runs under `vmap`.
-    """
+    """The checked arguments of `simulate`."""
 
     system: AbstractSystem
     scheme: AbstractScheme
@@ -39,7 +36,6 @@ class Task(eqx.Module):
     root_finder: RootFinder | ChordAlone
     max_halvings: int | None
     watcher: Watcher | None = None
-    may_have_lanes: bool = eqx.field(static=True, default=True)
 
     def stepper(self) -> Stepper:
         system, watcher = self.system, self.watcher
@@ -52,7 +48,6 @@ class Task(eqx.Module):
             root_finder=self.root_finder,
             max_halvings=self.max_halvings,
             watcher=self.watcher,
-            may_have_lanes=self.may_have_lanes,
         )
 
     @property

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from .._programs import unmerged
 from .._types import Count, Flag, Scalar
 from .linear.dense import AbstractFactors
 from .linear.jacobian import Linearisable
@@ -274,15 +273,8 @@ def _value_and_size(
     residual: Linearisable, x: Float[Array, " n"]
 ) -> tuple[Float[Array, " n"], Scalar]:
     """The residual, and its largest entry."""
-
-    def both(x: Array) -> tuple[Array, Array]:
-        value = residual.value(x)
-        return value, max_norm(value)
-
-    # XLA would otherwise evaluate parts of the residual again for each of its uses in the
-    # substitution.
-    value, defect = (both if residual.is_dense else unmerged(both))(x)
-    return value, defect
+    value = residual.value(x)
+    return value, max_norm(value)
 
 
 def _classify(

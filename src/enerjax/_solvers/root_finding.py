@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 from typing_extensions import TypeAliasType
 
-from .._programs import part, unmerged
+from .._programs import part
 from .._types import Count, Flag, Scalar
 from .chord_iterations import chord_iterations, PATIENCE, PATIENCE_ALONE
 from .linear.dense import AbstractFactors, Inverse, SMALL
@@ -182,11 +182,11 @@ def _by_chord(
     # Compiled separately: XLA would otherwise evaluate parts of the residual again for each
     # of its uses.
     def value(x: Array) -> Array:
-        return joined(unmerged(lambda x: leaves_of(fn(unravel(x), args)))(x))
+        return joined(leaves_of(fn(unravel(x), args)))
 
     def solve(right: Array) -> Array:
         correct = lambda x: leaves_of(chord.correct(unravel(x), args, prepared))
-        return joined(unmerged(correct)(right))
+        return joined(correct(right))
 
     search = lambda: chord_iterations(value, solve, newton, start, guess, patience)
     last = part(search)()

@@ -18,13 +18,11 @@ from ..numpy_primitives import (
     moved,
     MOVES,
 )
-from ..one_function.possible import FACTORS, NAME
-from ..one_function.rewriting import places_of_updates
-from ..one_function.small_matrices import in_plain_operations, is_small
-from ..primitives import LINEAR_SOLVE
+from ..primitives import FACTORS, LINEAR_SOLVE
 from .dense import BY_LOOPS, factors_by_loops
 from .elementwise import ELEMENTWISE
 from .graph import Graph, Node, Number
+from .small_matrices import in_plain_operations, is_small
 from .values import (
     Cellar,
     Cells,
@@ -41,6 +39,8 @@ from .values import (
 )
 
 
+# The name of the primitive that runs a program as one function.
+NAME = "enerjax_one_function"
 # The most products of numbers that a contraction is written out for.
 _MOST_PRODUCTS = 2_000
 
@@ -74,14 +74,12 @@ class Evaluation:
             return known[atom]
 
         for eqn in jaxpr.eqns:
-            if eqn.effects:
-                raise Unsupported(f"`{eqn.primitive.name}`, which has effects", eqn)
             try:
+                if eqn.effects:
+                    raise Unsupported(f"`{eqn.primitive.name}`, which has effects")
                 outs = self._equation(eqn, list(map(read, eqn.invars)))
             except Unsupported as reason:
-                # The innermost equation is the one to tell.
-                if len(reason.args) < 2:
-                    raise Unsupported(*reason.args, eqn) from None
+                reason.equations.append(eqn)
                 raise
             known.update(zip(eqn.outvars, outs, strict=True))
         return list(map(read, jaxpr.outvars))
@@ -932,7 +930,7 @@ def _scatter(self: Evaluation, eqn: Any, values: list[Value]) -> list[Value]:
         return [operand]
     if not isinstance(index, np.ndarray):
         return [_scattered_to_computed(self, eqn, values)]
-    places = places_of_updates(operand.shape, index, updates.shape, eqn.params)
+    places = _places_of_updates(operand.shape, index, updates.shape, eqn.params)
     if not adds:
         source, falls = np.arange(size), places >= 0
         source[places[falls]] = size + np.flatnonzero(falls)
@@ -940,6 +938,34 @@ def _scatter(self: Evaluation, eqn: Any, values: list[Value]) -> list[Value]:
         numbers = source.reshape(operand.shape)
         return [self.taken([operand, updates], firsts, numbers, dtype)]
     return [_added(self, operand, updates, places, dtype)]
+
+
+def _places_of_updates(
+    shape: tuple[int, ...], index: np.ndarray, update_shape: tuple[int, ...], params: Any
+) -> np.ndarray:
+    """The place in the flat array of each flat update; negative if it is dropped."""
+    dims, grid = params["dimension_numbers"], np.indices(update_shape)
+    windows, shared = dims.update_window_dims, dims.operand_batching_dims
+    at = [grid[k] for k in range(len(update_shape)) if k not in windows]
+    starts = index[tuple(at)]
+    skipped = (*dims.inserted_window_dims, *shared)
+    inner = [k for k in range(len(shape)) if k not in skipped]
+    first, within = np.zeros((2, len(shape), *update_shape), int)
+    room = np.array(shape) - 1
+    for axis, k in zip(inner, windows, strict=True):
+        within[axis] = grid[k]
+        room[axis] -= update_shape[k] - 1
+    for k, axis in enumerate(dims.scatter_dims_to_operand_dims):
+        first[axis] = starts[..., k]
+    for axis, k in zip(shared, dims.scatter_indices_batching_dims, strict=True):
+        first[axis] = at[k]
+    room = room.reshape(-1, *[1] * len(update_shape))
+    if params["mode"] == jax.lax.GatherScatterMode.CLIP:
+        first = np.clip(first, 0, room)
+    falls = np.all((first >= 0) & (first <= room), axis=0)
+    strides = np.cumprod([1, *shape[:0:-1]])[::-1]
+    places = np.tensordot(strides[: len(shape)], first + within, 1)
+    return np.where(falls, places, -1).ravel()
 
 
 def _added(self: Evaluation, operand, updates, places, dtype) -> Value:

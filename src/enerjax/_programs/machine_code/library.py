@@ -13,7 +13,7 @@ import numpy as np
 from .emission import Emission
 from .evaluation import Evaluation, rows_of_vectors
 from .loops import WIDTH
-from .values import Block, CONSTANTS, dtype_of, Memory, NotWideError, type_name, Value
+from .values import Block, Cellar, CONSTANTS, dtype_of, Memory, NotWideError, type_name, Value
 
 
 _CODES = {"f8": "double", "f4": "float", "b1": "i8"} | {
@@ -48,6 +48,16 @@ def compiled_function(
 def _compiled(
     jaxpr: Any, known: Sequence[np.ndarray | None], may_be_wide: bool
 ) -> Function:
+    return _function(*graph_of(jaxpr, known, may_be_wide))
+
+
+def graph_of(
+    jaxpr: Any, known: Sequence[np.ndarray | None], may_be_wide: bool = True
+) -> tuple[Cellar, list, list]:
+    """The graph of a program, with the cells of its inputs and outputs.
+
+    Raises `Unsupported`.
+    """
     evaluation = Evaluation(rows_of_vectors(jaxpr), may_be_wide)
     cellar = evaluation.cellar
     variables = [*jaxpr.constvars, *jaxpr.invars]
@@ -77,11 +87,11 @@ def _compiled(
         (dtype_of(x), cellar.memory(x).places.ravel() if np.prod(x.shape) else None)
         for x in outs
     ]
-    return _function(Emission(cellar), inputs, outputs)
+    return cellar, inputs, outputs
 
 
-def _function(emission: Emission, inputs: list, outputs: list) -> Function:
-    cellar = emission.cellar
+def _function(cellar: Cellar, inputs: list, outputs: list) -> Function:
+    emission = Emission(cellar)
     main = emission.main
     copies = _copies(emission, inputs, outputs)
     constants = np.concatenate([np.zeros(0, np.int64), *cellar.constants])

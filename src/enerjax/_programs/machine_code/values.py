@@ -13,6 +13,7 @@ import bisect
 from typing import Any, TypeAlias
 
 import numpy as np
+from jax.extend import source_info_util
 
 from .graph import as_number, Graph, Node, Number, number_type, Region
 
@@ -27,7 +28,20 @@ CONSTANTS = 1 << 40
 
 
 class Unsupported(Exception):
-    """A program that is not compiled here: the reason in words, and the operation."""
+    """A program that is not compiled here: the reason in words, and the operation.
+
+    - `equations`: the operation, and those whose programs it is in, outermost last.
+    """
+
+    def __init__(self, reason: str):
+        super().__init__(reason)
+        self.reason = reason
+        self.equations: list[Any] = []
+
+    def __str__(self) -> str:
+        infos = (x.source_info for x in self.equations)
+        lines = [line for line in map(source_info_util.summarize, infos) if line]
+        return f"{self.reason} in {lines[0]}" if lines else self.reason
 
 
 class NotWideError(Exception):

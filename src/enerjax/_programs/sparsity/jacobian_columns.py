@@ -21,8 +21,6 @@ from jaxtyping import Array, Float
 
 from ..jaxprs import evaluate, interpret
 from ..numpy_primitives import MOVES
-from ..one_function.api import unmerged
-from ..one_function.possible import LARGEST_SUM
 from ..primitives import ARITHMETIC, JIT
 
 
@@ -59,27 +57,8 @@ def batched_columns(
 
     They take longer to compute, but their program is compiled several times as fast.
     """
-    push = _push_apart(fn, x)
+    _, push = jax.linearize(fn, x)
     return jax.vmap(push, in_axes=1, out_axes=-1)(jnp.asarray(seeds, x.dtype))
-
-
-def _push_apart(
-    fn: Callable[[Array], Array], x: Float[Array, " n"]
-) -> Callable[[Array], Array]:
-    """The linear map of `fn` at `x`, whose coefficients are computed once.
-
-    XLA would otherwise compute them, such as sines of angles, again for every column.
-    """
-    programs: list[Any] = []
-
-    def coefficients(x: Array) -> tuple[Array, ...]:
-        program = jax.make_jaxpr(jax.linearize(fn, x)[1])(x)
-        programs.append(program.jaxpr)
-        return tuple(map(jnp.asarray, program.consts)) + (x, x)
-
-    *consts, _, _ = unmerged(coefficients)(x)
-    push = jaxpr_as_fun(ClosedJaxpr(programs[-1], consts))
-    return lambda seed: push(seed)[0]
 
 
 class _Columns:
@@ -169,12 +148,7 @@ def _transposed(x, k, *, permutation):
 
 
 def _summed(x, k, *, axes, **_):
-    # Each part is small enough to be a sum inside of one function of machine code.
-    count = max(-(-x.size // LARGEST_SUM), 1)
-    if count > min(k, _MAX_PARTS):
-        return jnp.sum(x, axis=axes)
-    parts = (jnp.sum(part, axis=axes) for part in jnp.array_split(x, count, axis=-1))
-    return jnp.concatenate([*parts], axis=-1)
+    return jnp.sum(x, axis=axes)
 
 
 def _split(x, k, *, sizes, axis):

@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from ..._programs import at_places, Indices, is_known, jacobian_pattern, summed, with_any
+from ..._programs import at_places, Indices, is_known, jacobian_pattern, with_any
 from ..._types import Flag
 
 
@@ -66,7 +66,7 @@ class BlockDiagonal(eqx.Module):
 
     def __matmul__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         by_block = at_places(x, self.places.read)[:, None, :]
-        return at_places(summed(self.blocks * by_block).ravel(), self.places.back)
+        return at_places(jnp.sum(self.blocks * by_block, axis=-1).ravel(), self.places.back)
 
     def __rmatmul__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         return self @ x  # symmetric

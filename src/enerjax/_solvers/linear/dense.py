@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ..._programs import in_one_function, LARGEST_SUM, unmerged
+from ..._programs import in_one_function
 from ..._types import Flag, Scalar
 from .norms import largest
 
@@ -82,14 +82,7 @@ def _inverse_jvp(primals, tangents):
     # Derivatives of any order consist of matrix products alone.
     (x,), (dx,) = primals, tangents
     y = inverse(x)
-    return y, -_sums(_sums(y, dx), y)
-
-
-def _sums(a: Float[Array, "n n"], b: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """`a @ b`, as a sum that is faster for batches of tangents."""
-    if a.shape[0] ** 3 > LARGEST_SUM:
-        return product(a, b)
-    return jnp.sum(a[:, :, None] * b[None], axis=1)
+    return y, -product(product(y, dx), y)
 
 
 class AbstractFactors(eqx.Module):
@@ -132,7 +125,7 @@ class Inverse(AbstractFactors):
 
         def improve(carry):
             x, error, _ = carry
-            error, size = unmerged(_square)(error)
+            error, size = _square(error)
             return x + product(x, error), error, size * size
 
         def is_lost(carry) -> Flag:
@@ -148,7 +141,7 @@ class Inverse(AbstractFactors):
             return inverse(one * matrix), error, jnp.zeros_like(left)
 
         x = self.inverse * sizes[None]
-        error, size = unmerged(_defect)(matrix, x)
+        error, size = _defect(matrix, x)
         carry = x + product(x, error), error, jnp.where(size < _FAR, size * size, size)
         carry = jax.lax.while_loop(is_rough, improve, carry)
         x, _, _ = jax.lax.while_loop(is_lost, start_again, carry)

@@ -17,7 +17,6 @@ from ..._programs import (
     jacobian_columns,
     jacobian_pattern,
     LARGE,
-    plain_products,
     shape_of,
 )
 from .block_tridiagonal import Band, coloured_products, column_colours
@@ -186,7 +185,7 @@ def linearisable(
     Jacobian is needed `rarely`, its program is one that compiles quickly. Structure is
     searched for where there are more unknowns than `small`.
     """
-    value = plain_products(fn, like, args)
+    value = lambda x: fn(x, args)
     if isinstance(linear_solver, lx.AbstractLinearSolver):
         return Linearisable(value, Dense(linear_solver), regularisation)
     regularised = (

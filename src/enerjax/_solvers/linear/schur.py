@@ -25,8 +25,6 @@ from ..._programs import (
     Indices,
     jacobian_pattern,
     shape_of,
-    summed,
-    unmerged,
     with_any,
 )
 from .block_diagonal import BlockDiagonal, Symmetric
@@ -163,12 +161,12 @@ class Schur(eqx.Module):
 
     def product(self, u: Float[Array, " n"]) -> Float[Array, " rows"]:
         """`B u`"""
-        return summed(self.rows * at_places(u, self.tables.read), 2)
+        return jnp.sum(self.rows * at_places(u, self.tables.read), axis=(-2, -1))
 
     def transposed(self, x: Float[Array, " rows"]) -> Float[Array, " n"]:
         """`B^T x`"""
         entries = jnp.append((self.rows * x[:, None, None]).ravel(), 0)
-        return summed(at_places(entries, self.tables.transposed))
+        return jnp.sum(at_places(entries, self.tables.transposed), axis=-1)
 
     def solve(self, right: Float[Array, "k rows"]) -> Float[Array, "k rows"]:
         """`G^-1` times each of `k` vectors."""
@@ -210,7 +208,7 @@ class Schur(eqx.Module):
 def _products(
     matrices: Float[Array, "n width width"], x: Float[Array, "n k width"]
 ) -> Float[Array, "n k width"]:
-    return summed(matrices[:, None] * x[:, :, None])
+    return jnp.sum(matrices[:, None] * x[:, :, None], axis=-1)
 
 
 def schur_tables(
@@ -239,9 +237,7 @@ def schur(
     With a `regularisation`, this is added to the diagonal of a `G` that may be singular.
     """
     products = coloured_products(fn, at, tables.colours)
-    # Compiled separately, because each entry is used many times, and XLA would otherwise
-    # compute it again for each use.
-    rows, weighted = unmerged(functools.partial(_weighted, tables))(products, weight)
+    rows, weighted = _weighted(tables, products, weight)
     diagonal, below = _blocks(tables, rows, weighted)
     if regularisation is not None:
         added = at_places(regularisation, tables.order).reshape(-1, tables.width, 1)
@@ -272,7 +268,7 @@ def _weighted(
         blocks = at_places(jnp.concatenate([weight.blocks, none]), tables.touched)
     else:
         blocks = weight[None, None]
-    return rows, summed(blocks * rows[:, :, None, :])
+    return rows, jnp.sum(blocks * rows[:, :, None, :], axis=-1)
 
 
 def _blocks(tables: SchurTables, rows: Array, weighted: Array) -> tuple[Array, Array]:
@@ -280,8 +276,7 @@ def _blocks(tables: SchurTables, rows: Array, weighted: Array) -> tuple[Array, A
     left, right = (jnp.append(x.ravel(), 0) for x in (weighted, rows))
 
     def blocks(table: np.ndarray) -> Array:
-        taken = lambda x, y: (at_places(x, table[0]), at_places(y, table[1]))
-        one, other = unmerged(taken)(left, right)
+        one, other = at_places(left, table[0]), at_places(right, table[1])
         terms = (one[:, k, :, None] * other[:, k, None] for k in range(table.shape[2]))
         shape = (table.shape[1], tables.width, tables.width)
         return functools.reduce(jnp.add, terms, jnp.zeros(shape, rows.dtype))

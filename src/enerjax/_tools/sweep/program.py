@@ -8,15 +8,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from ..._programs import compiled, run_side_by_side
-
-
-# The fastest batch of lanes on CPUs according to benchmarks/batch.py: more lanes do not fit
-# into the cache of a core, and all wait for the slowest. (Lanes of small systems run one
-# after the other in any case.)
-_BATCH_ON_CPU = 16
-# The fewest lanes of a batch that runs side by side, which its own program divides again.
-_BATCH_SIDE_BY_SIDE = 416
+from ..._programs import compiled
 
 
 def make_lane(fn: Callable, parameters: dict[str, Any]) -> tuple[Any, Any]:
@@ -58,13 +50,7 @@ class Chunk:
     def __init__(self, lane: Callable, traced: Any, lanes: int, batch_size: int | None):
         devices = jax.local_devices()
         share = -(-lanes // len(devices))
-        if batch_size is None:
-            batch_size = share
-            if devices[0].platform == "cpu":
-                many = -(-share // max(share // _BATCH_SIDE_BY_SIDE, 1))
-                is_side_by_side = run_side_by_side(traced.jaxpr.jaxpr, many)
-                batch_size = many if is_side_by_side else _BATCH_ON_CPU
-        batch_size = min(batch_size, share)
+        batch_size = share if batch_size is None else min(batch_size, share)
         self.lanes = lanes
         self.padded = len(devices) * batch_size * -(-share // batch_size)
         of_device = lambda parameters: jax.lax.map(lane, parameters, batch_size=batch_size)

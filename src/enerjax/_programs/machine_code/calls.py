@@ -1,0 +1,329 @@
+"""A primitive of JAX that runs a program as one function of machine code, on CPUs.
+
+On other processors, and where an operation has no machine code here, XLA compiles the
+program. The values are the same, but for round-off. Derivatives of a program are programs of
+this kind too; `jax.checkpoint` decides which values they keep.
+"""
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, Primitive
+from jax.interpreters import ad, batching, mlir
+from jax.interpreters.partial_eval import dce_jaxpr_consts
+from jaxtyping import Array, PyTree
+
+from ..jaxprs import known_numbers
+from .evaluation import NAME
+from .library import compiled_function, Function, graph_of
+from .values import Unsupported
+
+
+# The most numbers that a function returns: their places are tables while it is compiled.
+_MOST_RESULTS = 4_000_000
+# The lanes of a batch are computed by several calls if their results are more numbers.
+_MOST_OF_LANES = 1_000_000
+
+
+def in_one_function(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Array]]:
+    """`fn`, between trees of arrays, as one function of machine code where it can be.
+
+    The values are the same either way, but for round-off. The lanes of a batch are computed
+    several at a time, each with the iterations that it needs.
+    """
+    return functools.partial(_called, fn, False)
+
+
+def part(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Array]]:
+    """`in_one_function(fn)` for a part of a program that may be one function as a whole.
+
+    It is a function of its own only if the whole is none.
+    """
+    return functools.partial(_called, fn, True)
+
+
+def why_not_one_function(
+    fn: Callable[..., PyTree[Array]], *args: PyTree[Array]
+) -> tuple[str, ...]:
+    """What keeps `fn(*args)` from being one function, and its line.
+
+    The result is empty if it can be one function.
+    """
+    closed = jax.make_jaxpr(fn)(*args)
+    known = [*map(known_numbers, closed.consts), *[None] * len(closed.jaxpr.invars)]
+    try:
+        graph_of(closed.jaxpr, known)
+    except Unsupported as obstacle:
+        return (str(obstacle),)
+    return ()
+
+
+def _called(fn: Callable[..., PyTree[Array]], is_part: bool, *args: PyTree[Array]) -> Any:
+    closed, like = jax.make_jaxpr(fn, return_shape=True)(*args)
+    inputs = jax.tree.leaves(args)
+    if sum(x.size for x in closed.out_avals) > _MOST_RESULTS:
+        out = jaxpr_as_fun(closed)(*inputs)
+    else:
+        out = run_closed(closed, inputs, [True] * len(closed.out_avals), is_part)
+    return jax.tree.unflatten(jax.tree.structure(like), map(jnp.asarray, out))
+
+
+class Program:
+    """A program as the parameter of a primitive.
+
+    - `jaxpr`: its constants are passed as the first inputs. They can be traced, and a
+      program that held them would outlive their trace.
+    - `known`: the values of those inputs that are known; `None` for the others.
+    - `is_part`: whether the program is a part of a larger one. If the larger one is one
+      function, the part is not a function of its own.
+    - `linear`: the number of inputs, the last ones, that the program is linear in.
+    """
+
+    def __init__(
+        self,
+        jaxpr: Any,
+        known: Sequence[np.ndarray | None],
+        is_part: bool = False,
+        linear: int = 0,
+    ):
+        self.jaxpr, self.known = jaxpr, known
+        self.is_part, self.linear = is_part, linear
+        # Evaluations outside of other programs share one compilation.
+        self.compiled = jax.jit(lambda *numbers: list(self.bind(numbers)))
+
+    def bind(self, numbers: Sequence[Array]) -> list[Array]:
+        return ONE_FUNCTION.bind(*numbers, program=self)
+
+    @functools.cached_property
+    def function(self) -> Function | Unsupported:
+        """The function of machine code, or the reason why there is none."""
+        try:
+            return compiled_function(self.jaxpr, self.known)
+        except Unsupported as reason:
+            return reason
+
+    def __call__(self, numbers: Sequence[Array]) -> list[Array]:
+        """The outputs, computed by operations of JAX."""
+        pairs = zip(numbers, self.known, strict=True)
+        numbers = [x if known is None else known for x, known in pairs]
+        count = len(self.jaxpr.constvars)
+        closed = ClosedJaxpr(self.jaxpr, list(numbers[:count]))
+        return jaxpr_as_fun(closed)(*numbers[count:])
+
+    def run(self, numbers: Sequence[Array]) -> list[Array]:
+        """The outputs, computed by machine code where that is possible."""
+        function = self.function
+        if not isinstance(function, Function):
+            return self(numbers)
+        pairs = zip(numbers, self.known, strict=True)
+        taken = [x for x, known in pairs if known is None]
+        like = [
+            jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in self.jaxpr.outvars
+        ]
+        return jax.ffi.ffi_call(function.name, like)(*taken)
+
+
+def run_closed(
+    closed: ClosedJaxpr,
+    inputs: Sequence[Any],
+    wanted: Sequence[bool],
+    is_part: bool,
+    linear: int = 0,
+) -> list[Any]:
+    """The wanted outputs of a program, in one function where that is possible.
+
+    The others are `None`. An input that is an output too is returned without a copy.
+    """
+    numbers = [*closed.consts, *inputs]
+    variables = (*closed.jaxpr.constvars, *closed.jaxpr.invars)
+    inputs_by_id = {id(x): number for x, number in zip(variables, numbers, strict=True)}
+    handed_through = [id(x) in inputs_by_id for x in closed.jaxpr.outvars]
+    computed = [on and not same for on, same in zip(wanted, handed_through, strict=True)]
+    out = []
+    if any(computed):
+        jaxpr, of_consts, of_inputs = dce_jaxpr_consts(closed.jaxpr, computed)
+        needed, _ = _split([*of_consts, *of_inputs], numbers)
+        num_linear = sum(of_inputs[len(of_inputs) - linear :]) if linear else 0
+        # Only constants have the same values in every call. Whole numbers among the inputs
+        # are the places of tables.
+        num_consts = sum(of_consts)
+        known = [
+            known_numbers(x) if k < num_consts else _known_places(x)
+            for k, x in enumerate(needed)
+        ]
+        program = Program(jaxpr, known, is_part, num_linear)
+        out = program.bind(list(map(jnp.asarray, needed)))
+    _, variables = _split(computed, closed.jaxpr.outvars)
+    _, asked = _split(computed, wanted)
+    pairs = zip(variables, asked, strict=True)
+    return _merged(computed, out, [inputs_by_id[id(x)] if on else None for x, on in pairs])
+
+
+def _known_places(x: Any) -> np.ndarray | None:
+    """An array of whole numbers, if their values are known."""
+    if jnp.ndim(x) == 0 or jnp.issubdtype(x.dtype, jnp.inexact):
+        return None
+    return known_numbers(x)
+
+
+# The rules of the primitive ---------------------------------------------------------------
+
+
+def _evaluated(*numbers: Array, program: Program) -> list[Array]:
+    # With `jax_disable_jit`, as in the search for NaNs, another `jit` would come back here.
+    if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
+        return program(numbers)
+    return program.compiled(*numbers)
+
+
+def _shapes(*_: Any, program: Program) -> list[Any]:
+    return [x.aval for x in program.jaxpr.outvars]
+
+
+def _has_rate(tangent: Any) -> bool:
+    """Whether the rate of an input is not zero by its structure."""
+    return not isinstance(tangent, ad.Zero)
+
+
+def _jvp(primals: Any, tangents: Any, *, program: Program) -> tuple[list, list]:
+    """Values in one function, with the residuals of the linearisation; rates in another."""
+    has_tangent = list(map(_has_rate, tangents))
+    moved, _ = _split(has_tangent, tangents)
+    smooth = [jnp.issubdtype(x.aval.dtype, jnp.inexact) for x in program.jaxpr.outvars]
+
+    def linearised(*numbers):
+        own, still = _split(has_tangent, numbers)
+        values = lambda *own: _split(smooth, program(_merged(has_tangent, own, still)))
+        return jax.linearize(values, *own, has_aux=True)
+
+    closed, like = jax.make_jaxpr(linearised, return_shape=True)(*primals)
+    pushed = jax.make_jaxpr(lambda push, moved: push(*moved))(like[1], moved)
+    depends = _depends(pushed, len(moved))
+    _, _, uses = dce_jaxpr_consts(pushed.jaxpr, depends)
+    # The outputs of `closed`: values, residuals that the rates need, values without rates.
+    num_values, num_others = sum(smooth), len(smooth) - sum(smooth)
+    num_kept = len(closed.out_avals) - len(smooth)
+    wanted = [True] * num_values + uses[:num_kept] + [True] * num_others
+    out = run_closed(closed, primals, wanted, program.is_part)
+    kept = out[num_values : num_values + num_kept]
+    rates = run_closed(pushed, [*kept, *moved], depends, program.is_part, len(moved))
+    out = _merged(smooth, out[:num_values], out[num_values + num_kept :])
+    rates = _merged(smooth, rates, [None] * num_others)
+    zeros = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in out]
+    return out, [z if x is None else x for x, z in zip(rates, zeros, strict=True)]
+
+
+def _depends(closed: ClosedJaxpr, linear: int) -> list[bool]:
+    """Which outputs of a program depend on its last `linear` inputs."""
+    jaxpr: Any = closed.jaxpr
+    on = {id(x) for x in jaxpr.invars[len(jaxpr.invars) - linear :]}
+    for eqn in jaxpr.eqns:
+        if any(id(x) in on for x in eqn.invars):
+            on.update(id(x) for x in eqn.outvars)
+    return [id(x) in on for x in jaxpr.outvars]
+
+
+def _transpose(cotangents: Any, *numbers: Any, program: Program) -> list:
+    wanted = [ad.is_undefined_primal(x) for x in numbers]
+    unknown, known = _split(wanted, numbers)
+    has_cotangent = [not isinstance(ct, ad.Zero) for ct in cotangents]
+    cotangents, _ = _split(has_cotangent, cotangents)
+
+    def pulled(known, cotangents):
+        push = lambda *own: _split(has_cotangent, program(_merged(wanted, own, known)))[0]
+        return jax.linear_transpose(push, *(x.aval for x in unknown))(cotangents)
+
+    closed = jax.make_jaxpr(pulled)(known, cotangents)
+    depends = _depends(closed, len(cotangents))
+    inputs = [*known, *cotangents]
+    out = run_closed(closed, inputs, depends, program.is_part, len(cotangents))
+    zeros = [ad.Zero(x.aval) for x in unknown]
+    out = [x if on else zero for on, x, zero in zip(depends, out, zeros, strict=True)]
+    return _merged(wanted, out, [None] * len(known))
+
+
+def _lanes(numbers: Any, axes: Any, *, program: Program) -> tuple[list, list[int]]:
+    batched = [axis is not None for axis in axes]
+    moved = [
+        x if axis is None else jnp.moveaxis(x, axis, 0)
+        for x, axis in zip(numbers, axes, strict=True)
+    ]
+    own, shared = _split(batched, moved)
+    out = _of_lanes(program, own, shared, batched)
+    return out, [0] * len(out)
+
+
+def _of_lanes(
+    program: Program, own: list[Array], shared: list[Array], batched: list[bool]
+) -> list[Array]:
+    """The outputs for all lanes: loops in which each has the iterations that it needs."""
+    of_lane = lambda own: program(_merged(batched, own, shared))
+    if any(map(_is_sharded, own)):
+        # Each device computes its own lanes.
+        return jax.vmap(of_lane)(own)
+    still = len(batched) - program.linear
+    if program.linear and not any(batched[:still]):
+        # Many directions at one point share everything but the directions themselves.
+        closed = jax.make_jaxpr(jax.vmap(of_lane))(own)
+        wanted = [True] * len(closed.out_avals)
+        return run_closed(closed, own, wanted, program.is_part, len(own))
+    closed = lambda own: jax.make_jaxpr(lambda own: jax.lax.map(of_lane, own))(own)
+    run = lambda own: run_closed(closed(own), own, wanted, program.is_part)
+    wanted, lanes = [True] * len(program.jaxpr.outvars), len(own[0])
+    size = sum(math.prod(x.aval.shape) for x in program.jaxpr.outvars)
+    most = max(_MOST_OF_LANES // max(size, 1), 1)
+    if lanes <= most:
+        return run(own)
+    chunks = lanes // most
+    first = [x[: chunks * most].reshape(chunks, most, *x.shape[1:]) for x in own]
+    out = jax.lax.map(run, first)
+    out = [x.reshape(chunks * most, *x.shape[2:]) for x in out]
+    if chunks * most == lanes:
+        return out
+    rest = run([x[chunks * most :] for x in own])
+    return [jnp.concatenate(pair) for pair in zip(out, rest, strict=True)]
+
+
+def _is_sharded(x: Array) -> bool:
+    """Whether an array is sharded over axes of a mesh that its type names."""
+    return any(axis is not None for axis in jax.typeof(x).sharding.spec)
+
+
+def _lowered_for_cpu(*numbers: Array, program: Program) -> list[Array]:
+    return program.run(numbers)
+
+
+def _lowered(*numbers: Array, program: Program) -> list[Array]:
+    return program(numbers)
+
+
+def _new_primitive() -> Primitive:
+    primitive = Primitive(NAME)
+    primitive.multiple_results = True
+    primitive.def_impl(_evaluated)
+    primitive.def_abstract_eval(_shapes)
+    ad.primitive_jvps[primitive] = _jvp
+    ad.primitive_transposes[primitive] = _transpose
+    batching.primitive_batchers[primitive] = _lanes
+    mlir.register_lowering(primitive, mlir.lower_fun(_lowered))
+    mlir.register_lowering(primitive, mlir.lower_fun(_lowered_for_cpu), platform="cpu")
+    return primitive
+
+
+ONE_FUNCTION = _new_primitive()
+
+
+def _split(which: Sequence[bool], values: Sequence[Any]) -> tuple[list, list]:
+    pairs = list(zip(which, values, strict=True))
+    return [x for on, x in pairs if on], [x for on, x in pairs if not on]
+
+
+def _merged(which: Sequence[bool], chosen: Sequence[Any], rest: Sequence[Any]) -> list:
+    """The inverse of `_split`."""
+    first, others = iter(chosen), iter(rest)
+    return [next(first if on else others) for on in which]
