@@ -421,8 +421,7 @@ class _Stack:
         size = math.prod(value.shape)
         if size == 0:
             return
-        numbers, _ = _numbers(self_, value, np.arange(size).reshape(value.shape))
-        if all(isinstance(x, Node) and x.lanes and not x.is_reduced for x in numbers):
+        if _has_lanes(self_, value):
             self.stride = size
             self.owners, self.places = _block(self_, value, length)
         else:
@@ -446,15 +445,24 @@ class _Stack:
         return Memory(dtype, rows + self.places)
 
 
+def _has_lanes(self: "Evaluation", value: Value) -> bool:
+    """Whether an array consists of numbers of many lanes."""
+    if isinstance(value, Memory):
+        found = self.cellar.columns(value.places.ravel())
+        return found is not None and found[1].size == 0
+    return isinstance(value, Cells) and value.lane is not None
+
+
 def _rows_in_order(self: "Evaluation", x: Value) -> Value:
     """An array in memory whose rows are at equal distances."""
     if isinstance(x, np.ndarray):
         return x
     memory = self.cellar.memory(x)
-    flat = memory.places.reshape(len(memory.places), -1)
+    places = self.cellar.of_one_memory(memory.places, memory.dtype)
+    flat = places.reshape(len(places), -1)
     steps = np.diff(flat, axis=0)
     if steps.size == 0 or np.all(steps == steps[0, 0]):
-        return memory
+        return Memory(memory.dtype, places)
     return self.cellar.contiguous(memory)
 
 

@@ -232,6 +232,7 @@ class Cellar:
 
     def lanes_at(self, places: np.ndarray, dtype: str) -> Number:
         """The numbers in a cell for each lane."""
+        places = self.of_one_memory(places, dtype)
         first, n = int(places[0]), places.size
         steps = np.diff(places)
         stride = int(steps[0])
@@ -248,6 +249,23 @@ class Cellar:
         if not is_affine:
             extra = self.scattered(places)
         return self.graph.at(region, level, "load", dtype, markers, extra, n)
+
+    def of_one_memory(self, places: np.ndarray, dtype: str) -> np.ndarray:
+        """The cells, or copies, such that all or none have a number for each pass."""
+        owners = self._all_owners(places.ravel())
+        if len({x.region.is_wide for x in owners}) < 2:
+            return places
+        region = self.graph.current
+        while region.parent is not None and region.parent.is_wide:
+            region = region.parent
+        copies = {}
+        for place in np.unique(places).tolist():
+            if place < CONSTANTS and not self.is_wide(place):
+                x = self.number_at(place, dtype)
+                copy = self.graph.at(region, 0, "copy", dtype, (x,))
+                copies[place] = self.place_of(copy, dtype)
+        flat = [copies.get(p, p) for p in places.ravel().tolist()]
+        return np.array(flat).reshape(places.shape)
 
     def readable(self, places: np.ndarray) -> tuple[Region, int, tuple[Node, ...]]:
         """From where on all cells can be read: the region, the level in it, and markers.
@@ -377,9 +395,9 @@ class Cellar:
     def contiguous(self, value: Value) -> Memory:
         """The array in memory, in the order of its entries."""
         memory = self.memory(value)
-        flat = memory.places.ravel()
+        flat = self.of_one_memory(memory.places.ravel(), memory.dtype)
         if flat.size < 2 or np.all(np.diff(flat) == 1):
-            return memory
+            return Memory(memory.dtype, flat.reshape(memory.shape))
         if flat.size < _FEWEST_LANES:
             copies = [
                 self.graph.node(
