@@ -43,7 +43,6 @@ class CanonicalModel(AbstractModel):
         self.scales = self._scales(state)
         self.constraint_tables = self._tables(state)
 
-
     @property
     def has_own_momenta(self) -> bool:
         return True

@@ -17,8 +17,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from .._discrete import (
     AbstractCorrected,
@@ -115,7 +114,6 @@ class SeparableModel(AbstractModel):
         self.inverse_inertia = inverse_of(self.inertia)
         self.scales = self._scales(state)
         self.constraint_tables = self._constraint_tables(state)
-
 
     @property
     def has_own_momenta(self) -> bool:

@@ -118,6 +118,7 @@ MOVES: dict[str, Callable] = {
     "split": _split,
     "stack": lambda *xs, axis, **_: [np.stack(xs, axis)],
     "squeeze": lambda x, *, dimensions, **_: [np.squeeze(x, dimensions)],
+    "tile": lambda x, *, reps, **_: [np.tile(x, reps)],
     "transpose": lambda x, *, permutation, **_: [np.transpose(x, permutation)],
     "unstack": _unstack,
 }

@@ -109,9 +109,7 @@ def _of_each(fn: Callable, num_axes: int, *values: Array) -> Any:
     return fn(*values)
 
 
-def factors_by_loops(
-    name: str, values: list[Array], params: dict[str, Any]
-) -> list[Array]:
+def factors_by_loops(name: str, values: list[Array], params: dict[str, Any]) -> list[Array]:
     """The outputs of `lu`, `cholesky` or `triangular_solve`."""
     if name == "cholesky":
         return [_of_each(_cholesky, 2, *values)]

@@ -1,7 +1,7 @@
 """The primitives of JAX that compute each entry by itself, as operations of the graph."""
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from .graph import as_number, FUNCTIONS, Graph, Number
 

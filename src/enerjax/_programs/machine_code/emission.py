@@ -26,7 +26,9 @@ class Emission:
     def __init__(self, cellar: Cellar):
         self.cellar, self._root = cellar, cellar.graph.root
         self.functions: list[str] = []
-        self.declared: set[str] = {f"declare i1 @llvm.vector.reduce.or.v{WIDTH}i1(<{WIDTH} x i1>)"}
+        self.declared: set[str] = {
+            f"declare i1 @llvm.vector.reduce.or.v{WIDTH}i1(<{WIDTH} x i1>)"
+        }
         regions = list(_all_regions(self._root))
         self._uniform: dict[Node, bool] = {}
         self._counters = {
@@ -204,7 +206,9 @@ class Emission:
         """Which passes are active in a region, as numbers."""
         if region.mask is None:
             return "splat (i64 1)"
-        return self._name(f"load <{WIDTH} x i64>, ptr {self._cell(region.mask, True)}, align 8")
+        return self._name(
+            f"load <{WIDTH} x i64>, ptr {self._cell(region.mask, True)}, align 8"
+        )
 
     def _decide(self, item: While, on: str, off: str) -> None:
         is_wide = item.body.is_wide

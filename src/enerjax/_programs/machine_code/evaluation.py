@@ -14,11 +14,12 @@ from ..jaxprs import programs_within, solution_program, wrapped_program
 from ..numpy_primitives import (
     evaluated,
     FUNCTIONS as FUNCTIONS_OF_NUMPY,
-    is_inside,
     moved,
     MOVES,
 )
 from ..primitives import FACTORS, LINEAR_SOLVE
+from .computed_places import dynamic_slice, dynamic_update_slice, gather, scatter
+from .contraction import contraction
 from .dense import BY_LOOPS, factors_by_loops
 from .elementwise import ELEMENTWISE
 from .graph import Graph, Node, Number
@@ -31,7 +32,6 @@ from .values import (
     lane_of,
     Memory,
     MOST_CELLS,
-    number_at,
     objects,
     type_name,
     Unsupported,
@@ -41,8 +41,6 @@ from .values import (
 
 # The name of the primitive that runs a program as one function.
 NAME = "enerjax_one_function"
-# The most products of numbers that a contraction is written out for.
-_MOST_PRODUCTS = 2_000
 
 _SAME = frozenset(
     """
@@ -63,7 +61,9 @@ class Evaluation:
         # The rows in which vectors of some lengths are read.
         self.rows_of = rows_of or {}
 
-    def outputs(self, jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Value]:
+    def outputs(
+        self, jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]
+    ) -> list[Value]:
         """The values of the outputs of a program."""
         known: dict[Any, Value] = dict(zip(jaxpr.constvars, consts, strict=True))
         known.update(zip(jaxpr.invars, args, strict=True))
@@ -102,6 +102,8 @@ class Evaluation:
         name, params = eqn.primitive.name, eqn.params
         if name in _SAME:
             return list(values)
+        if name == "platform_index":
+            return [np.asarray(_place_of_cpu(params["platforms"]), np.int32)]
         if name == "custom_vmap_call":
             return self.closed(params["call"], values)
         inner = wrapped_program(eqn)
@@ -292,7 +294,9 @@ class Evaluation:
             own = np.arange(flat.size).reshape(x.cells.shape) + len(pool)
             size = flat.size * n
             cell[first : first + size] = np.repeat(own, n, x.lane).ravel()
-            along = np.arange(n).reshape([-1 if k == x.lane else 1 for k in range(own.ndim)])
+            along = np.arange(n).reshape(
+                [-1 if k == x.lane else 1 for k in range(own.ndim)]
+            )
             lane[first : first + size] = np.broadcast_to(along, x.shape).ravel()
             pool.extend(flat)
         for axis in range(numbers.ndim):
@@ -314,19 +318,11 @@ class Evaluation:
                     flat.append(pool[cell[column[0]]])
                     continue
                 if rest is None:
-                    rest = self._flat_values(values)
-                flat.append(self._column(rest, column))
+                    flats = (self.cellar.memory(x).places.ravel() for x in values)
+                    rest = np.concatenate([*flats])
+                flat.append(self.cellar.lanes_at(rest[column], dtype))
             return self.cells(dtype, objects(flat, tuple(kept)), axis, n)
         return None
-
-    def _flat_values(self, values: list[Value]) -> np.ndarray:
-        places = [self.cellar.memory(x).places.ravel() for x in values]
-        dtype = next(dtype_of(x) for x in values)
-        return dtype, np.concatenate(places)  # type: ignore
-
-    def _column(self, rest: Any, column: np.ndarray) -> Number:
-        dtype, places = rest
-        return self.cellar.lanes_at(places[column], dtype)
 
     # Reductions ---------------------------------------------------------------------------
 
@@ -352,7 +348,9 @@ class Evaluation:
         moved_cells = np.transpose(cells, [*order, *axes])
         first = [cells.shape[k] for k in order]
         rows = moved_cells.reshape(math.prod(first), -1)
-        fold = lambda row: functools.reduce(lambda a, b: self.graph.op(op, dtype, (a, b)), row)
+        fold = lambda row: functools.reduce(
+            lambda a, b: self.graph.op(op, dtype, (a, b)), row
+        )
         flat = [fold(row) for row in rows.tolist()]
         if lane is not None and lane in axes:
             flat = [self._over_lanes(op, dtype, x, shape[lane]) for x in flat]
@@ -418,6 +416,51 @@ class Evaluation:
         ]
         return self.cells(memory.dtype, objects(flat, tuple(kept)), None, 1)
 
+    def dynamic(
+        self, first: int, stride: int, offset: Node, dtype: str, n: int, of: Memory
+    ) -> Node:
+        """The number at a cell of `of` that is `offset` behind the first."""
+        region, level, markers = self.cellar.readable(of.places)
+        markers = (*markers, self.cellar.marker(region, level))
+        extra = int(first), stride
+        return self.graph.node("dynamic", dtype, (offset, *markers), extra, lanes=n)
+
+    def subarray(self, value: Value, index: Any) -> Value:
+        numbers = np.arange(math.prod(value.shape)).reshape(value.shape)[index]
+        if isinstance(value, np.ndarray):
+            return value[index]
+        firsts = np.array([0, math.prod(value.shape)])
+        return self.taken([value], firsts, numbers, dtype_of(value))
+
+    def replaced(self, value: Value, part: Value, index: Any) -> Value:
+        size = math.prod(value.shape)
+        numbers = np.arange(size).reshape(value.shape)
+        numbers[index] = size + np.arange(math.prod(part.shape)).reshape(part.shape)
+        firsts = np.array([0, size, size + math.prod(part.shape)])
+        return self.taken([value, part], firsts, numbers, dtype_of(value))
+
+    def reshaped(self, value: Value, shape: tuple[int, ...]) -> Value:
+        if isinstance(value, np.ndarray):
+            return value.reshape(shape)
+        if isinstance(value, Memory):
+            return Memory(value.dtype, value.places.reshape(shape))
+        numbers = np.arange(math.prod(value.shape)).reshape(shape)
+        firsts = np.array([0, math.prod(value.shape)])
+        return self.taken([value], firsts, numbers, value.dtype)
+
+    def moved_to_known(self, primitive, x, indices, params) -> list[Value]:
+        """A move to places that are known."""
+        numbers = np.arange(math.prod(x.shape)).reshape(x.shape)
+        (out,) = moved(primitive, [numbers, indices], params)
+        firsts = np.array([0, numbers.size])
+        return [self.taken([x], firsts, np.asarray(out), dtype_of(x))]
+
+    def total(self, op: str, value: Value, axes: Any) -> Value:
+        if isinstance(value, np.ndarray):
+            join = {"add": np.sum, "mul": np.prod, "max": np.max, "min": np.min}[op]
+            return np.asarray(join(value, axis=axes), value.dtype)
+        return self.reduced(op, value, axes)
+
 
 def _is_laned(x: Value) -> bool:
     return isinstance(x, Cells) and x.lane is not None
@@ -459,6 +502,12 @@ def known_constant(x: Any) -> Value:
     if isinstance(x, jax.core.Tracer):
         raise Unsupported("a constant that is not known")
     return np.asarray(x)
+
+
+def _place_of_cpu(platforms: Any) -> int:
+    """The place of the platform that machine code is for; `None` stands for all."""
+    is_ours = [names is None or "cpu" in names for names in platforms]
+    return is_ours.index(True)
 
 
 def _known(eqn: Any, values: list[Any]) -> list[Value]:
@@ -529,97 +578,6 @@ def _running(self: Evaluation, eqn: Any, values: list[Value]) -> list[Value]:
     return [self.cells(dtype, np.moveaxis(stacked, 0, axis), None, 1)]
 
 
-def _contraction(self: Evaluation, eqn: Any, values: list[Value]) -> list[Value]:
-    """A product of arrays: products of entries, and their sums."""
-    (contracted_left, contracted_right), (batch_left, batch_right) = eqn.params[
-        "dimension_numbers"
-    ]
-    left, right = values
-    out = eqn.outvars[0].aval
-    terms = math.prod(left.shape[k] for k in contracted_left)
-    if out.size == 0 or terms == 0:
-        return [np.zeros(out.shape, out.dtype)]
-    dtype = type_name(out.dtype)
-    free = lambda x, a, b: [k for k in range(len(x.shape)) if k not in (*a, *b)]
-    free_left = free(left, contracted_left, batch_left)
-    free_right = free(right, contracted_right, batch_right)
-    shape = [
-        *(left.shape[k] for k in batch_left),
-        *(left.shape[k] for k in free_left),
-        *(right.shape[k] for k in free_right),
-        *(left.shape[k] for k in contracted_left),
-    ]
-    size = math.prod(shape)
-    lanes = [
-        x.n if isinstance(x, Cells) and x.lane is not None else 1 for x in (left, right)
-    ]
-    longest = max(max(shape), *lanes)
-    if size // longest > _MOST_PRODUCTS:
-        return [_large_product(self, eqn, values)]
-    nb, nl, nr, nc = map(len, (batch_left, free_left, free_right, contracted_left))
-    turn = lambda x, order: self.move(
-        jax.lax.transpose_p, [x], dict(permutation=tuple(order))
-    )[0]
-    left = turn(left, [*batch_left, *free_left, *contracted_left])
-    right = turn(right, [*batch_right, *free_right, *contracted_right])
-    spread = lambda x, dims: self.move(
-        jax.lax.broadcast_in_dim_p,
-        [x],
-        dict(shape=tuple(shape), broadcast_dimensions=tuple(dims), sharding=None),
-    )[0]
-    at = list(range(len(shape)))
-    left = spread(left, [*at[: nb + nl], *at[nb + nl + nr :]])
-    right = spread(right, [*at[:nb], *at[nb + nl : nb + nl + nr], *at[nb + nl + nr :]])
-    of = [dtype_of(left), dtype_of(right)]
-    rule = lambda a, b: self.graph.op(
-        "mul",
-        dtype,
-        (
-            self.graph.op("convert", dtype, (a,), of[0]),
-            self.graph.op("convert", dtype, (b,), of[1]),
-        ),
-    )
-    product = self.map(rule, [left, right], tuple(shape), dtype)
-    if nc == 0:
-        return [product]
-    return [self.reduced_known("add", product, tuple(at[nb + nl + nr :]))]
-
-
-def _large_product(self: Evaluation, eqn: Any, values: list[Value]) -> Value:
-    """A product of large arrays, row by row in a loop."""
-    numbers = eqn.params["dimension_numbers"]
-    left, right = values
-    (contracted_left, _), (batch_left, _) = numbers
-    free = [k for k in range(len(left.shape)) if k not in (*contracted_left, *batch_left)]
-    if batch_left or not free:
-        if batch_left:
-            by_row = lambda a, b: jax.lax.map(
-                lambda x: jax.lax.dot_general(*x, _without_batch(numbers)),
-                (jnp.moveaxis(a, batch_left[0], 0), jnp.moveaxis(b, numbers[1][1][0], 0)),
-            )
-            if len(batch_left) > 1:
-                raise Unsupported("a product of large arrays with several batch axes")
-            return self.function(by_row, left, right)[0]
-        raise Unsupported("a product of very large arrays")
-    axis = free[0]
-    dims = tuple(k - (k > axis) for k in contracted_left)
-    inner = ((dims, numbers[0][1]), ((), ()))
-    place = 0
-
-    def by_row(a, b):
-        rows = jnp.moveaxis(a, axis, 0)
-        out = jax.lax.map(lambda row: jax.lax.dot_general(row, b, inner), rows)
-        return jnp.moveaxis(out, 0, place)
-
-    return self.function(by_row, left, right)[0]
-
-
-def _without_batch(numbers: Any) -> Any:
-    (left, right), (batch_left, batch_right) = numbers
-    less = lambda axes, batch: tuple(k - (k > batch[0]) for k in axes)
-    return (less(left, batch_left), less(right, batch_right)), ((), ())
-
-
 def _iota(self: Evaluation, eqn: Any, values: list[Value]) -> list[Value]:
     return _known(eqn, values)
 
@@ -665,440 +623,16 @@ def _factors(self: Evaluation, eqn: Any, values: list[Value]) -> list[Value]:
     return self.function(fn, *values)
 
 
-# Places that are computed while the program runs ------------------------------------------
-
-
-def _whole_number(self: Evaluation, x: Number, of: str) -> Number:
-    return self.graph.op("convert", "i8", (x,), of)
-
-
-def _clamped(self: Evaluation, x: Number, high: int) -> Number:
-    x = self.graph.op("max", "i8", (x, 0))
-    return self.graph.op("min", "i8", (x, high))
-
-
-def _at_computed(
-    self: Evaluation, value: Value, starts: list[Number], sizes: Sequence[int]
-) -> Value:
-    """A slice of an array that begins at a computed place of each axis."""
-    memory = self.cellar.contiguous(value)
-    if math.prod(sizes) == 0:
-        return np.zeros(tuple(sizes), memory.dtype)
-    strides = np.cumprod([1, *memory.shape[:0:-1]])[::-1]
-    graph, dtype = self.graph, memory.dtype
-    offset: Number = 0
-    for start, stride in zip(starts, strides.tolist(), strict=True):
-        offset = graph.add("i8", offset, graph.multiply("i8", start, stride))
-    first = memory.places[tuple(slice(0, n) for n in sizes)]
-    if not isinstance(offset, Node):
-        return Memory(dtype, first + offset)
-    lane = None if offset.lanes else lane_of([], tuple(sizes))
-    if lane is None:
-        flat = [self._dynamic(x, 0, offset, dtype, 0, memory) for x in first.ravel()]
-        return self.cells(dtype, objects(flat, tuple(sizes)), None, 1)
-    n = sizes[lane]
-    kept = list(sizes)
-    kept[lane] = 1
-    columns = np.moveaxis(first, lane, -1).reshape(-1, n)
-    flat = [
-        self._dynamic(x[0], int(x[1] - x[0]), offset, dtype, n, memory)
-        for x in columns
-    ]
-    return self.cells(dtype, objects(flat, tuple(kept)), lane, n)
-
-
-def _dynamic(
-    self: Evaluation, first: int, stride: int, offset: Node, dtype: str, n: int, of: Memory
-) -> Node:
-    """The number at a cell of `of` that is `offset` behind the first."""
-    region, level, markers = self.cellar.readable(of.places)
-    markers = (*markers, self.cellar.marker(region, level))
-    extra = int(first), stride
-    return self.graph.node("dynamic", dtype, (offset, *markers), extra, lanes=n)
-
-
-Evaluation._dynamic = _dynamic  # type: ignore
-
-
-def _dynamic_slice(self: Evaluation, eqn: Any, values: list[Value]) -> list[Value]:
-    x, *starts = values
-    sizes = eqn.params["slice_sizes"]
-    numbers = [
-        _clamped(self, _whole_number(self, self.cellar.unlaned(s).item(), dtype_of(s)), n - k)
-        for s, n, k in zip(starts, x.shape, sizes, strict=True)
-    ]
-    return [_at_computed(self, x, numbers, sizes)]
-
-
-def _dynamic_update_slice(self: Evaluation, eqn: Any, values: list[Value]) -> list[Value]:
-    x, update, *starts = values
-    graph, dtype = self.graph, dtype_of(x)
-    if math.prod(update.shape) == 0:
-        return [x]
-    numbers = [
-        _clamped(self, _whole_number(self, self.cellar.unlaned(s).item(), dtype_of(s)), n - k)
-        for s, n, k in zip(starts, x.shape, update.shape, strict=True)
-    ]
-    if not any(isinstance(k, Node) for k in numbers):
-        flat = np.arange(math.prod(x.shape)).reshape(x.shape)
-        at = tuple(slice(k, k + n) for k, n in zip(numbers, update.shape, strict=True))
-        flat[at] = flat.size + np.arange(math.prod(update.shape)).reshape(update.shape)
-        firsts = np.array([0, math.prod(x.shape), math.prod(x.shape) + math.prod(update.shape)])
-        return [self.taken([x, update], firsts, flat, dtype)]
-    moving = [k for k, number in enumerate(numbers) if isinstance(number, Node)]
-    out = x
-    wide = [update.shape[k] for k in moving]
-    if math.prod(wide) > 64:
-        raise Unsupported("a slice that is written to computed places")
-    for within in np.ndindex(*wide):
-        # One place along each computed axis; the others are known.
-        index = [slice(None)] * len(x.shape)
-        at = [slice(k, k + n) if not isinstance(k, Node) else slice(None)
-              for k, n in zip(numbers, update.shape, strict=True)]
-        for axis, k in zip(moving, within, strict=True):
-            index[axis] = slice(k, k + 1)
-        part = self._subarray(update, tuple(index))
-        target = list(x.shape)
-        for axis, k in enumerate(numbers):
-            if axis not in moving:
-                target[axis] = update.shape[axis]
-        spread = self.move(
-            jax.lax.broadcast_in_dim_p,
-            [part],
-            dict(
-                shape=tuple(target),
-                broadcast_dimensions=tuple(range(len(target))),
-                sharding=None,
-            ),
-        )[0]
-        masks = []
-        for axis, k in zip(moving, within, strict=True):
-            place = np.arange(x.shape[axis]).reshape(
-                [-1 if j == axis else 1 for j in range(len(target))]
-            )
-            masks.append(np.broadcast_to(place - k, tuple(target)))
-        starts_here = [numbers[axis] for axis in moving]
-
-        def rule(old, new, *places, starts_here=starts_here):
-            on: Number = True
-            for start, place in zip(starts_here, places, strict=True):
-                on = graph.op("and", "b1", (on, graph.compare("eq", "i8", start, place)))
-            return graph.select(dtype, on, new, old)
-
-        old = self._subarray(out, tuple(at))
-        new = self.map(rule, [old, spread, *masks], tuple(target), dtype)
-        out = new if tuple(target) == x.shape else self._replaced(out, new, tuple(at))
-    return [out]
-
-
-def _subarray(self: Evaluation, value: Value, index: Any) -> Value:
-    numbers = np.arange(math.prod(value.shape)).reshape(value.shape)[index]
-    if isinstance(value, np.ndarray):
-        return value[index]
-    firsts = np.array([0, math.prod(value.shape)])
-    return self.taken([value], firsts, numbers, dtype_of(value))
-
-
-def _replaced(self: Evaluation, value: Value, part: Value, index: Any) -> Value:
-    size = math.prod(value.shape)
-    numbers = np.arange(size).reshape(value.shape)
-    numbers[index] = size + np.arange(math.prod(part.shape)).reshape(part.shape)
-    firsts = np.array([0, size, size + math.prod(part.shape)])
-    return self.taken([value, part], firsts, numbers, dtype_of(value))
-
-
-Evaluation._subarray = _subarray  # type: ignore
-Evaluation._replaced = _replaced  # type: ignore
-
-
-def _gather(self: Evaluation, eqn: Any, values: list[Value]) -> list[Value]:
-    x, indices = values
-    params, dtype, out = eqn.params, dtype_of(x), eqn.outvars[0].aval
-    if isinstance(indices, np.ndarray) and is_inside(x, indices, **_shape_only(params)):
-        return self.move_from(eqn.primitive, x, indices, params)
-    numbers, sizes, graph = params["dimension_numbers"], params["slice_sizes"], self.graph
-    joint = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
-    kept = [axis for axis in range(len(x.shape)) if axis not in joint]
-    if out.size == 0:
-        return [np.zeros(out.shape, out.dtype)]
-    memory = self.cellar.contiguous(x)
-    strides = np.cumprod([1, *x.shape[:0:-1]])[::-1].tolist()
-    before, of = indices.shape[:-1], dtype_of(indices)
-    first: Value = np.zeros(before, np.int64)
-    inside: Value = np.ones(before, bool)
-    fills = jax.lax.GatherScatterMode.from_any(params["mode"]) == _FILLS
-    for axis, along in zip(
-        numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True
-    ):
-        shape = [-1 if k == along else 1 for k in range(len(before))]
-        first = first + strides[axis] * np.arange(x.shape[axis]).reshape(shape)
-    for column, axis in enumerate(numbers.start_index_map):
-        own = self._subarray(indices, (..., slice(column, column + 1)))
-        own, high = self._reshaped(own, before), x.shape[axis] - sizes[axis]
-
-        def place(index, sofar, high=high, stride=strides[axis]):
-            index = _clamped(self, _whole_number(self, index, of), high)
-            return graph.add("i8", sofar, graph.multiply("i8", index, stride))
-
-        def is_in(index, sofar, high=high):
-            index = _whole_number(self, index, of)
-            for how, bound in (("ge", 0), ("le", high)):
-                now = graph.compare(how, "i8", index, bound)
-                sofar = graph.op("and", "b1", (sofar, now))
-            return sofar
-
-        first = self.map(place, [own, first], before, "i8")
-        if fills:
-            inside = self.map(is_in, [own, inside], before, "b1")
-    window = np.zeros([sizes[k] for k in kept], np.int64)
-    for k, axis in enumerate(kept):
-        shape = [-1 if j == k else 1 for j in range(len(kept))]
-        window = window + strides[axis] * np.arange(sizes[axis]).reshape(shape)
-    others = tuple(k for k in range(out.ndim) if k not in numbers.offset_dims)
-    spread = lambda value, dims: self.move(
-        jax.lax.broadcast_in_dim_p,
-        [value],
-        dict(shape=out.shape, broadcast_dimensions=dims, sharding=None),
-    )[0]
-    start = int(memory.places.ravel()[0])
-    filling = _filling(params, dtype)
-
-    def taken(first, within, on):
-        offset = graph.add("i8", first, within)
-        if isinstance(offset, Node):
-            found = self._dynamic(start, 0, offset, dtype, 0, memory)
-        else:
-            found = self.cellar.number_at(start + offset, dtype)
-        return graph.select(dtype, on, found, filling) if fills else found
-
-    parts = [spread(first, others), spread(window, tuple(numbers.offset_dims))]
-    return [self.map(taken, [*parts, spread(inside, others)], out.shape, dtype)]
-
-
-_FILLS = jax.lax.GatherScatterMode.FILL_OR_DROP
-
-
-def _filling(params: Any, dtype: str) -> Number:
-    """What is found outside of an array."""
-    value = params.get("fill_value")
-    if value is not None:
-        return value
-    if dtype[0] == "f":
-        return float("nan")
-    if dtype[0] == "i":
-        return int(np.iinfo(dtype).min)
-    return int(np.iinfo(dtype).max) if dtype[0] == "u" else True
-
-
-def _shape_only(params: Any) -> Any:
-    return dict(
-        dimension_numbers=params["dimension_numbers"], slice_sizes=params["slice_sizes"]
-    )
-
-
-def _reshaped(self: Evaluation, value: Value, shape: tuple[int, ...]) -> Value:
-    if isinstance(value, np.ndarray):
-        return value.reshape(shape)
-    if isinstance(value, Memory):
-        return Memory(value.dtype, value.places.reshape(shape))
-    numbers = np.arange(math.prod(value.shape)).reshape(shape)
-    firsts = np.array([0, math.prod(value.shape)])
-    return self.taken([value], firsts, numbers, value.dtype)
-
-
-Evaluation._reshaped = _reshaped  # type: ignore
-
-
-def _move_from(self: Evaluation, primitive, x, indices, params) -> list[Value]:
-    """A move to places that are known."""
-    numbers = np.arange(math.prod(x.shape)).reshape(x.shape)
-    (out,) = moved(primitive, [numbers, indices], params)
-    firsts = np.array([0, numbers.size])
-    return [self.taken([x], firsts, np.asarray(out), dtype_of(x))]
-
-
-Evaluation.move_from = _move_from  # type: ignore
-
-
-def _scatter(self: Evaluation, eqn: Any, values: list[Value]) -> list[Value]:
-    operand, index, updates = values
-    dtype, adds = dtype_of(operand), eqn.primitive.name == "scatter-add"
-    if eqn.params.get("update_jaxpr") is not None and not adds:
-        pass
-    size, count = math.prod(operand.shape), math.prod(updates.shape)
-    if count == 0:
-        return [operand]
-    if not isinstance(index, np.ndarray):
-        return [_scattered_to_computed(self, eqn, values)]
-    places = _places_of_updates(operand.shape, index, updates.shape, eqn.params)
-    if not adds:
-        source, falls = np.arange(size), places >= 0
-        source[places[falls]] = size + np.flatnonzero(falls)
-        firsts = np.array([0, size, size + count])
-        numbers = source.reshape(operand.shape)
-        return [self.taken([operand, updates], firsts, numbers, dtype)]
-    return [_added(self, operand, updates, places, dtype)]
-
-
-def _places_of_updates(
-    shape: tuple[int, ...], index: np.ndarray, update_shape: tuple[int, ...], params: Any
-) -> np.ndarray:
-    """The place in the flat array of each flat update; negative if it is dropped."""
-    dims, grid = params["dimension_numbers"], np.indices(update_shape)
-    windows, shared = dims.update_window_dims, dims.operand_batching_dims
-    at = [grid[k] for k in range(len(update_shape)) if k not in windows]
-    starts = index[tuple(at)]
-    skipped = (*dims.inserted_window_dims, *shared)
-    inner = [k for k in range(len(shape)) if k not in skipped]
-    first, within = np.zeros((2, len(shape), *update_shape), int)
-    room = np.array(shape) - 1
-    for axis, k in zip(inner, windows, strict=True):
-        within[axis] = grid[k]
-        room[axis] -= update_shape[k] - 1
-    for k, axis in enumerate(dims.scatter_dims_to_operand_dims):
-        first[axis] = starts[..., k]
-    for axis, k in zip(shared, dims.scatter_indices_batching_dims, strict=True):
-        first[axis] = at[k]
-    room = room.reshape(-1, *[1] * len(update_shape))
-    if params["mode"] == jax.lax.GatherScatterMode.CLIP:
-        first = np.clip(first, 0, room)
-    falls = np.all((first >= 0) & (first <= room), axis=0)
-    strides = np.cumprod([1, *shape[:0:-1]])[::-1]
-    places = np.tensordot(strides[: len(shape)], first + within, 1)
-    return np.where(falls, places, -1).ravel()
-
-
-def _added(self: Evaluation, operand, updates, places, dtype) -> Value:
-    """Updates added to known places."""
-    size, count = math.prod(operand.shape), math.prod(updates.shape)
-    order = np.argsort(places, kind="stable")
-    order = order[places[order] >= 0]
-    to = places[order]
-    before = np.arange(to.size) - np.searchsorted(to, to)
-    repeats = int(before.max(initial=-1)) + 1
-    zero = np.zeros((1,), dtype)
-    firsts = np.array([0, count, count + 1])
-    # The few places with many updates, such as a body that all others are attached to, are
-    # added up by themselves: passes over all places would be many.
-    often = np.unique(to[before >= 8]) if repeats > 8 else to[:0]
-    is_often = np.isin(to, often)
-    out = operand
-    if often.size:
-        sums = []
-        for place in often:
-            own = self.taken([updates, zero], firsts, order[to == place], dtype)
-            sums.append(self._reshaped(self.reduced_known("add", own, (0,)), (1,)))
-        sums.append(zero)
-        total = self.move(jax.lax.concatenate_p, sums, dict(dimension=0))[0]
-        numbers = np.full(size, often.size)
-        numbers[often] = np.arange(often.size)
-        spread = self.taken(
-            [total], np.array([0, often.size + 1]), numbers.reshape(operand.shape), dtype
-        )
-        out = _sum(self, out, spread, dtype)
-    before, to, order = (x[~is_often] for x in (before, to, order))
-    for k in range(int(before.max(initial=-1)) + 1):
-        numbers = np.full(size, count)
-        numbers[to[before == k]] = order[before == k]
-        row = self.taken([updates, zero], firsts, numbers.reshape(operand.shape), dtype)
-        out = _sum(self, out, row, dtype)
-    return out
-
-
-def _sum(self: Evaluation, a: Value, b: Value, dtype: str) -> Value:
-    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
-        return a + b
-    if isinstance(a, np.ndarray) and not np.any(a):
-        return b
-    return self.map(lambda x, y: self.graph.add(dtype, x, y), [a, b], a.shape, dtype)
-
-
-def _reduced_known(self: Evaluation, op: str, value: Value, axes: Any) -> Value:
-    if isinstance(value, np.ndarray):
-        join = {"add": np.sum, "mul": np.prod, "max": np.max, "min": np.min}[op]
-        return np.asarray(join(value, axis=axes), value.dtype)
-    return self.reduced(op, value, axes)
-
-
-Evaluation.reduced_known = _reduced_known  # type: ignore
-
-
-def _scattered_to_computed(self: Evaluation, eqn: Any, values: list[Value]) -> Value:
-    """Updates at computed places: every place asks whether an update is its own."""
-    operand, index, updates = values
-    params, graph, dtype = eqn.params, self.graph, dtype_of(operand)
-    dims = params["dimension_numbers"]
-    adds = eqn.primitive.name == "scatter-add"
-    if dims.operand_batching_dims:
-        raise Unsupported("a scatter with batch axes at computed places")
-    rows = index.shape[:-1]
-    count = math.prod(rows)
-    size = math.prod(operand.shape)
-    kept = [k for k in range(len(operand.shape)) if k not in dims.inserted_window_dims]
-    window = [updates.shape[k] for k in dims.update_window_dims]
-    mapped = dims.scatter_dims_to_operand_dims
-    if count * size > 8 * MOST_CELLS or any(
-        window[kept.index(axis)] != 1 for axis in mapped if axis in kept
-    ):
-        raise Unsupported("a scatter to computed places")
-    batch = [k for k in range(len(updates.shape)) if k not in dims.update_window_dims]
-    turned = self.move(
-        jax.lax.transpose_p,
-        [updates],
-        dict(permutation=(*batch, *dims.update_window_dims)),
-    )[0]
-    turned = self._reshaped(turned, (count, *window))
-    starts = self.cellar.unlaned(index).reshape(count, -1)
-    of, out = dtype_of(index), operand
-    clips = params["mode"] == jax.lax.GatherScatterMode.CLIP
-    for k in range(count):
-        part = self._subarray(turned, (slice(k, k + 1),))
-        full = [1 if a in dims.inserted_window_dims else window[kept.index(a)]
-                for a in range(len(operand.shape))]
-        if any(n not in (1, m) for n, m in zip(full, operand.shape, strict=True)):
-            raise Unsupported("a scatter of windows to computed places")
-        part = self._reshaped(part, tuple(full))
-        part = self.move(
-            jax.lax.broadcast_in_dim_p,
-            [part],
-            dict(
-                shape=operand.shape,
-                broadcast_dimensions=tuple(range(len(full))),
-                sharding=None,
-            ),
-        )[0]
-        masks, numbers = [], []
-        for axis, entry in zip(mapped, starts[k].tolist(), strict=True):
-            entry = _whole_number(self, entry, of)
-            if clips:
-                entry = _clamped(self, entry, operand.shape[axis] - 1)
-            numbers.append(entry)
-            place = np.arange(operand.shape[axis]).reshape(
-                [-1 if j == axis else 1 for j in range(len(full))]
-            )
-            masks.append(np.broadcast_to(place, operand.shape))
-
-        def rule(old, new, *places, numbers=numbers):
-            on: Number = True
-            for number, place in zip(numbers, places, strict=True):
-                on = graph.op("and", "b1", (on, graph.compare("eq", "i8", number, place)))
-            new = graph.add(dtype, old, new) if adds else new
-            return graph.select(dtype, on, new, old)
-
-        out = self.map(rule, [out, part, *masks], operand.shape, dtype)
-    return out
-
-
 _RULES: dict[str, Callable[[Evaluation, Any, list[Value]], list[Value]]] = {
     **dict.fromkeys(_OPS, _reduction),
     **dict.fromkeys("cumsum cumprod cummax cummin".split(), _running),
     **dict.fromkeys(("argmax", "argmin"), _extreme_place),
-    **dict.fromkeys(("scatter", "scatter-add"), _scatter),
+    **dict.fromkeys(("scatter", "scatter-add"), scatter),
     **dict.fromkeys(FACTORS, _factors),
-    "dot_general": _contraction,
-    "dynamic_slice": _dynamic_slice,
-    "dynamic_update_slice": _dynamic_update_slice,
-    "gather": _gather,
+    "dot_general": contraction,
+    "dynamic_slice": dynamic_slice,
+    "dynamic_update_slice": dynamic_update_slice,
+    "gather": gather,
     "iota": _iota,
     LINEAR_SOLVE: _linear_solve,
 }

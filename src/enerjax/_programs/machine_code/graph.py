@@ -301,7 +301,9 @@ def _folded(op: str, dtype: str, operands: tuple[Any, ...], extra: Any) -> Numbe
         if op in _SHIFTS:
             kind = np.dtype(dtype)
             size = 8 * kind.itemsize
-            return as_number(_SHIFTS[op](*(np.array(x, kind) for x in operands), size), dtype)
+            return as_number(
+                _SHIFTS[op](*(np.array(x, kind) for x in operands), size), dtype
+            )
         return as_number(_FOLD[op](*operands), dtype)
 
 

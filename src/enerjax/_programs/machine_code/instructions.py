@@ -207,7 +207,9 @@ class Instructions:
         of = node.extra
         t, from_type = self._t(dtype), self._t(of)
         if of[0] == "f" and dtype[0] == "f":
-            return self._say(f"{'fpext' if dtype == 'f8' else 'fptrunc'} {from_type} {x} to {t}")
+            return self._say(
+                f"{'fpext' if dtype == 'f8' else 'fptrunc'} {from_type} {x} to {t}"
+            )
         if of[0] == "f":
             if dtype == "b1":
                 return self._say(f"fcmp une {from_type} {x}, {self._known(0.0, of)}")
@@ -247,11 +249,14 @@ class Instructions:
         out = "poison"
         for k in range(self.vector):
             ones = [
-                self._say(f"extractelement <{self.vector} x {kind}> {x}, i64 {k}") for x in xs
+                self._say(f"extractelement <{self.vector} x {kind}> {x}, i64 {k}")
+                for x in xs
             ]
             given = ", ".join(f"{kind} {x}" for x in ones)
             one = self._say(f"call {kind} {whole}({given})")
-            out = self._say(f"insertelement <{self.vector} x {kind}> {out}, {kind} {one}, i64 {k}")
+            out = self._say(
+                f"insertelement <{self.vector} x {kind}> {out}, {kind} {one}, i64 {k}"
+            )
         return out
 
     def _neutral(self, node: Node) -> str:

@@ -8,8 +8,6 @@ in a memory of its own.
 from collections.abc import Callable
 from typing import Any, TYPE_CHECKING
 
-import numpy as np
-
 from .graph import Node, Number, Region
 from .instructions import Instructions, TYPES
 from .loops import Scan, WIDTH
@@ -201,7 +199,9 @@ class Kernel(Instructions):
         if self.step > 1 and stride == 1 and table is None:
             return self._load_vector(self._pointer(self._lane_index(first, 1, None)), dtype)
         if self.step > 1:
-            pointers = [self._lane_pointer(k, first, stride, table) for k in range(self.step)]
+            pointers = [
+                self._lane_pointer(k, first, stride, table) for k in range(self.step)
+            ]
             return self._load_each(pointers, dtype)
         if not self._lanes_have_passes(first, table):
             return self._load_single(self._lane_pointer(0, first, stride, table), dtype)

@@ -13,7 +13,16 @@ import numpy as np
 from .emission import Emission
 from .evaluation import Evaluation, rows_of_vectors
 from .loops import WIDTH
-from .values import Block, Cellar, CONSTANTS, dtype_of, Memory, NotWideError, type_name, Value
+from .values import (
+    Block,
+    Cellar,
+    CONSTANTS,
+    dtype_of,
+    Memory,
+    NotWideError,
+    type_name,
+    Value,
+)
 
 
 _CODES = {"f8": "double", "f4": "float", "b1": "i8"} | {
@@ -32,9 +41,7 @@ class Function:
         self.name, self.length = name, length
 
 
-def compiled_function(
-    jaxpr: Any, known: Sequence[np.ndarray | None]
-) -> Function:
+def compiled_function(jaxpr: Any, known: Sequence[np.ndarray | None]) -> Function:
     """The function of a program, of the inputs whose values are not known.
 
     Raises `Unsupported`.
@@ -96,27 +103,29 @@ def _function(cellar: Cellar, inputs: list, outputs: list) -> Function:
     copies = _copies(emission, inputs, outputs)
     constants = np.concatenate([np.zeros(0, np.int64), *cellar.constants])
     # Tables of distances have no constants' cells.
-    tables = [
-        emission.addresses(x) if np.any(x >= CONSTANTS) else x for x in cellar.tables
-    ]
+    tables = [emission.addresses(x) if np.any(x >= CONSTANTS) else x for x in cellar.tables]
     size = 8 * (cellar.num_constants + cellar.size)
     handler = _HANDLER.replace("$SIZE$", str(max(size, 8)))
-    handler = handler.replace("$WIDE$", str(max(WIDTH * size, 8) if emission.has_passes else 8))
+    handler = handler.replace(
+        "$WIDE$", str(max(WIDTH * size, 8) if emission.has_passes else 8)
+    )
     handler = handler.replace("$NUMBER$", str(constants.size * emission.has_passes))
     handler = handler.replace("$CONSTANTS$", str(8 * constants.size))
     handler = handler.replace("$COPIES_IN$", copies[0]).replace("$COPIES_OUT$", copies[1])
-    text = "\n".join([
-        *sorted(emission.declared),
-        *emission.functions,
-        main,
-        _helpers(),
-        handler,
-        _widened(),
-        "attributes #3 = { nounwind optnone noinline }",
-        'attributes #0 = { nounwind noinline "no-trapping-math"="true" }',
-        "attributes #2 = { nounwind noinline optnone }",
-        "attributes #1 = { nounwind willreturn memory(none) }",
-    ])
+    text = "\n".join(
+        [
+            *sorted(emission.declared),
+            *emission.functions,
+            main,
+            _helpers(),
+            handler,
+            _widened(),
+            "attributes #3 = { nounwind optnone noinline }",
+            'attributes #0 = { nounwind noinline "no-trapping-math"="true" }',
+            "attributes #2 = { nounwind noinline optnone }",
+            "attributes #1 = { nounwind willreturn memory(none) }",
+        ]
+    )
     digest = hashlib.sha256(text.encode())
     for x in (constants, *tables):
         digest.update(x.tobytes())
@@ -184,7 +193,10 @@ def _helpers() -> str:
     out = []
     for dtype, kind in _CODES.items():
         cell = "double" if dtype[0] == "f" else "i64"
-        load = [f"  %a = getelementptr {kind}, ptr %x, i64 %k", f"  %v = load {kind}, ptr %a"]
+        load = [
+            f"  %a = getelementptr {kind}, ptr %x, i64 %k",
+            f"  %v = load {kind}, ptr %a",
+        ]
         widen, narrow = "  %w = ", "  %w = "
         if kind == cell:
             widen += f"bitcast {kind} %v to {cell}"
@@ -202,7 +214,10 @@ def _helpers() -> str:
         two = "ptr %x, ptr %y"
         body = "\n".join([*load, widen, *store(cell)])
         out.append(_LOOP.format(name=f"in_{dtype}", args=two, body=body))
-        read = [f"  %a = getelementptr {cell}, ptr %x, i64 %k", f"  %v = load {cell}, ptr %a"]
+        read = [
+            f"  %a = getelementptr {cell}, ptr %x, i64 %k",
+            f"  %v = load {cell}, ptr %a",
+        ]
         body = "\n".join([*read, narrow, *store(kind)])
         out.append(_LOOP.format(name=f"out_{dtype}", args=two, body=body))
         find = [

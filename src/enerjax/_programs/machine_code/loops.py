@@ -9,14 +9,12 @@ from collections.abc import Callable, Sequence
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
-from jax.extend.core import Literal
 
 from ..counting import num_equations
 from .graph import Node, Number, Region
 from .values import (
     Block,
     Cells,
-    CONSTANTS,
     dtype_of,
     Memory,
     MOST_CELLS,
@@ -288,9 +286,7 @@ class _Carry:
             for value, places in zip(self.values, self.places, strict=True)
         ]
 
-    def commit(
-        self, region: Region, results: list[Value], mask: int | None = None
-    ) -> None:
+    def commit(self, region: Region, results: list[Value], mask: int | None = None) -> None:
         """Writes the values after a pass, after all else in it."""
         writes = [
             self._prepared(value, places, mask)
@@ -367,7 +363,11 @@ def _scan(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
     params = eqn.params
     closed, length, reverse = params["jaxpr"], params["length"], params["reverse"]
     first, count = params["num_consts"], params["num_carry"]
-    consts, carry, rows = values[:first], values[first : first + count], values[first + count :]
+    consts, carry, rows = (
+        values[:first],
+        values[first : first + count],
+        values[first + count :],
+    )
     if length == 0:
         stacked = [np.zeros((0, *x.shape), x.dtype) for x in closed.out_avals[count:]]
         return [*carry, *stacked]
@@ -484,9 +484,7 @@ def _row(self: "Evaluation", x: Value, counter: Node) -> Value:
     if lane is None or math.prod(shape) // shape[lane] > MOST_CELLS:
         if math.prod(shape) > 4 * MOST_CELLS:
             raise Unsupported("a loop over rows of a very large array")
-        flat_row = [
-            self._dynamic(p, 0, offset, x.dtype, 0, x) for p in first.ravel()
-        ]
+        flat_row = [self.dynamic(p, 0, offset, x.dtype, 0, x) for p in first.ravel()]
         return self.cells(x.dtype, objects(flat_row, shape), None, 1)
     n = shape[lane]
     kept = list(shape)
@@ -494,13 +492,10 @@ def _row(self: "Evaluation", x: Value, counter: Node) -> Value:
     columns = np.moveaxis(first, lane, -1).reshape(-1, n)
     steps = np.diff(columns, axis=1)
     if not np.all(steps == steps[:, :1]):
-        flat_row = [
-            self._dynamic(p, 0, offset, x.dtype, 0, x) for p in first.ravel()
-        ]
+        flat_row = [self.dynamic(p, 0, offset, x.dtype, 0, x) for p in first.ravel()]
         return self.cells(x.dtype, objects(flat_row, shape), None, 1)
     flat_row = [
-        self._dynamic(c[0], int(c[1] - c[0]), offset, x.dtype, n, x)
-        for c in columns
+        self.dynamic(c[0], int(c[1] - c[0]), offset, x.dtype, n, x) for c in columns
     ]
     return self.cells(x.dtype, objects(flat_row, tuple(kept)), lane, n)
 
@@ -508,7 +503,9 @@ def _row(self: "Evaluation", x: Value, counter: Node) -> Value:
 def _written_out(self, closed, consts, carry, rows, length, reverse) -> list[Value]:
     count, stacked = len(carry), []
     for k in range(length)[:: -1 if reverse else 1]:
-        own = [self._reshaped(self._subarray(x, (slice(k, k + 1),)), x.shape[1:]) for x in rows]
+        own = [
+            self.reshaped(self.subarray(x, (slice(k, k + 1),)), x.shape[1:]) for x in rows
+        ]
         out = self.closed(closed, [*consts, *carry, *own])
         carry = _as_types(out[:count], closed.out_avals[:count])
         stacked.append(_as_types(out[count:], closed.out_avals[count:]))
@@ -516,7 +513,7 @@ def _written_out(self, closed, consts, carry, rows, length, reverse) -> list[Val
         stacked.reverse()
     out = []
     for k, aval in enumerate(closed.out_avals[count:]):
-        parts = [self._reshaped(row[k], (1, *aval.shape)) for row in stacked]
+        parts = [self.reshaped(row[k], (1, *aval.shape)) for row in stacked]
         out.append(self.joined(parts))
     return [*carry, *out]
 

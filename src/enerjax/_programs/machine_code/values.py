@@ -228,7 +228,9 @@ class Cellar:
     def _constant_at(self, place: int, dtype: str) -> Number:
         number = place - CONSTANTS
         block = bisect.bisect_right(self._constant_starts, number) - 1
-        return from_bits(self.constants[block][number - self._constant_starts[block]], dtype)
+        return from_bits(
+            self.constants[block][number - self._constant_starts[block]], dtype
+        )
 
     def lanes_at(self, places: np.ndarray, dtype: str) -> Number:
         """The numbers in a cell for each lane."""
@@ -306,7 +308,9 @@ class Cellar:
         owner = np.searchsorted(starts, safe, side="right") - 1
         lanes = self._lane_array()[owner]
         offset = safe - starts[owner]
-        column = np.where(lanes >= _FEWEST_LANES, starts[owner] + offset - offset % lanes, -1)
+        column = np.where(
+            lanes >= _FEWEST_LANES, starts[owner] + offset - offset % lanes, -1
+        )
         column[is_constant] = -1
         order = np.lexsort((places, column))
         sorted_columns = column[order]
@@ -401,7 +405,10 @@ class Cellar:
         if flat.size < _FEWEST_LANES:
             copies = [
                 self.graph.node(
-                    "copy", memory.dtype, (self.number_at(int(p), memory.dtype),), (k, self.size)
+                    "copy",
+                    memory.dtype,
+                    (self.number_at(int(p), memory.dtype),),
+                    (k, self.size),
                 )
                 for k, p in enumerate(flat)
             ]

@@ -1,4 +1,4 @@
-"""Lanes and derivatives of programs that are one function of machine code."""
+"""Derivatives, and derivatives of lanes, of programs as machine code."""
 
 import jax
 import jax.numpy as jnp
@@ -7,14 +7,10 @@ import pytest
 
 import enerjax as ej
 from enerjax._programs import in_one_function
-from enerjax._programs.jaxprs import programs_within
 from enerjax._solvers import eigh, find_root, Newton
 
 from .helpers import long
-from .test_one_function import is_marked, pytestmark, X
-
-
-__all__ = ["pytestmark"]
+from .test_machine_code import is_compiled, SMALL
 
 
 def smooth(x):
@@ -22,43 +18,26 @@ def smooth(x):
 
 
 def test_derivatives_and_lanes():
-    whole, xs = in_one_function(smooth), jnp.stack([X, 2 * X, 3 * X])
+    whole, xs = in_one_function(smooth), jnp.stack([SMALL, 2 * SMALL, 3 * SMALL])
     total = lambda f: lambda x: jnp.sum(f(x) ** 2)
     for of in (
-        lambda f: f(X),
-        lambda f: jax.jvp(f, (X,), (X,)),
-        lambda f: jax.grad(total(f))(X),
-        lambda f: jax.jvp(jax.grad(total(f)), (X,), (X,)),
-        lambda f: (jax.jacfwd(f)(X), jax.jacrev(f)(X), jax.hessian(total(f))(X)),
-        lambda f: jax.grad(lambda x: total(jax.grad(total(f)))(x))(X),
-        lambda f: jax.linear_transpose(jax.linearize(f, X)[1], X)(X),
+        lambda f: f(SMALL),
+        lambda f: jax.jvp(f, (SMALL,), (SMALL,)),
+        lambda f: jax.grad(total(f))(SMALL),
+        lambda f: jax.jvp(jax.grad(total(f)), (SMALL,), (SMALL,)),
+        lambda f: (
+            jax.jacfwd(f)(SMALL),
+            jax.jacrev(f)(SMALL),
+            jax.hessian(total(f))(SMALL),
+        ),
+        lambda f: jax.grad(lambda x: total(jax.grad(total(f)))(x))(SMALL),
+        lambda f: jax.linear_transpose(jax.linearize(f, SMALL)[1], SMALL)(SMALL),
         lambda f: jax.vmap(f)(xs),
         lambda f: jax.vmap(jax.grad(total(f)))(xs),
         lambda f: jax.vmap(jax.vmap(f))(xs[None]),
     ):
         close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=0)
         jax.tree.map(close, jax.jit(lambda of=of: of(whole))(), of(smooth))
-
-
-def test_lanes_run_one_after_the_other():
-    """Each with its own iterations, and as it does alone, to the bit."""
-    count = lambda x: jax.lax.while_loop(lambda c: c[0] < x[0, 0], _turn, (0.0, x))
-    whole, xs = in_one_function(count), jnp.arange(12000.0).reshape(2000, 2, 3) / 3000
-    lanes = jax.jit(jax.vmap(whole))
-    assert is_marked(lanes, xs)
-    turns, ends = lanes(xs)
-    for lane in (0, 7, 1999):
-        alone = jax.jit(whole)(xs[lane])
-        assert turns[lane] == alone[0] == np.ceil(xs[lane, 0, 0])
-        np.testing.assert_array_equal(ends[lane], alone[1])
-    # Where one lane cannot be one function, they are compiled as usual.
-    not_possible = jax.vmap(in_one_function(lambda x: jnp.linalg.qr(x)[0]))
-    assert not is_marked(not_possible, jnp.eye(3)[None])
-
-
-def _turn(carry):
-    turns, x = carry
-    return turns + 1, jnp.sin(x) + x
 
 
 # Derivatives of batches ------------------------------------------------------------------
@@ -181,33 +160,14 @@ def test_inputs_that_become_constants_are_passed_as_inputs():
     np.testing.assert_allclose(rate, difference, rtol=0, atol=1e-9)
 
 
-def in_loops(jaxpr, inside=False):
-    """The primitives of loops outside of programs that are one function."""
-    for eqn in jaxpr.eqns:
-        name = eqn.primitive.name
-        if inside:
-            yield name
-        if name != "enerjax_one_function":
-            for inner in programs_within(eqn):
-                yield from in_loops(inner, inside or name in ("scan", "while"))
-
-
-@pytest.mark.parametrize("derivative", long(["first", "second"], "second"))
-def test_runs_of_small_systems_are_one_function(derivative):
-    """And so are their derivatives: nothing is left but sums over segments."""
-    system, start, args = ej.problems.pendulum()
+@pytest.mark.parametrize("name", long(["four_bar", "car_axis", "heavy_top"], "car_axis"))
+def test_runs_and_their_derivatives_are_one_function(name):
+    system, start, args = getattr(ej.problems, name)()
     run = lambda args: ej.simulate(
-        system, ej.EnergyPreserving(), start, args, h=0.01, num_steps=200, throw=False
+        system, ej.EnergyPreserving(), start, args, h=1e-3, num_steps=20, throw=False
     )
-    slope = jax.grad(lambda args: jnp.sum(run(args).ys.q))
-    fn = slope
-    if derivative == "first":
-        assert is_marked(run, args)
-    else:
-        fn = lambda args: jax.jvp(slope, (args,), (args,))
-    assert is_marked(fn, args)
-    left = set(in_loops(jax.make_jaxpr(fn)(args).jaxpr))
-    assert left == {"enerjax_one_function", "add_any"}
+    assert is_compiled(run, args)
+    assert is_compiled(jax.grad(lambda args: jnp.sum(run(args).ys.q)), args)
 
 
 @pytest.mark.slow

@@ -1,0 +1,389 @@
+"""Entries at places that are computed while a program runs, and sums of entries at places."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, TYPE_CHECKING
+
+import jax
+import numpy as np
+
+from ..numpy_primitives import is_inside
+from .graph import Node, Number
+from .values import dtype_of, lane_of, Memory, MOST_CELLS, objects, Unsupported, Value
+
+
+if TYPE_CHECKING:
+    from .evaluation import Evaluation
+
+_FILLS = jax.lax.GatherScatterMode.FILL_OR_DROP
+
+
+def _whole_number(self: "Evaluation", x: Number, of: str) -> Number:
+    return self.graph.op("convert", "i8", (x,), of)
+
+
+def _clamped(self: "Evaluation", x: Number, high: int) -> Number:
+    x = self.graph.op("max", "i8", (x, 0))
+    return self.graph.op("min", "i8", (x, high))
+
+
+def _at_computed(
+    self: "Evaluation", value: Value, starts: list[Number], sizes: Sequence[int]
+) -> Value:
+    """A slice of an array that begins at a computed place of each axis."""
+    memory = self.cellar.contiguous(value)
+    if math.prod(sizes) == 0:
+        return np.zeros(tuple(sizes), memory.dtype)
+    strides = np.cumprod([1, *memory.shape[:0:-1]])[::-1]
+    graph, dtype = self.graph, memory.dtype
+    offset: Number = 0
+    for start, stride in zip(starts, strides.tolist(), strict=True):
+        offset = graph.add("i8", offset, graph.multiply("i8", start, stride))
+    first = memory.places[tuple(slice(0, n) for n in sizes)]
+    if not isinstance(offset, Node):
+        return Memory(dtype, first + offset)
+    lane = None if offset.lanes else lane_of([], tuple(sizes))
+    if lane is None:
+        flat = [self.dynamic(x, 0, offset, dtype, 0, memory) for x in first.ravel()]
+        return self.cells(dtype, objects(flat, tuple(sizes)), None, 1)
+    n = sizes[lane]
+    kept = list(sizes)
+    kept[lane] = 1
+    columns = np.moveaxis(first, lane, -1).reshape(-1, n)
+    flat = [self.dynamic(x[0], int(x[1] - x[0]), offset, dtype, n, memory) for x in columns]
+    return self.cells(dtype, objects(flat, tuple(kept)), lane, n)
+
+
+def dynamic_slice(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
+    x, *starts = values
+    sizes = eqn.params["slice_sizes"]
+    numbers = [
+        _clamped(
+            self, _whole_number(self, self.cellar.unlaned(s).item(), dtype_of(s)), n - k
+        )
+        for s, n, k in zip(starts, x.shape, sizes, strict=True)
+    ]
+    return [_at_computed(self, x, numbers, sizes)]
+
+
+def dynamic_update_slice(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
+    x, update, *starts = values
+    graph, dtype = self.graph, dtype_of(x)
+    if math.prod(update.shape) == 0:
+        return [x]
+    numbers = [
+        _clamped(
+            self, _whole_number(self, self.cellar.unlaned(s).item(), dtype_of(s)), n - k
+        )
+        for s, n, k in zip(starts, x.shape, update.shape, strict=True)
+    ]
+    if not any(isinstance(k, Node) for k in numbers):
+        flat = np.arange(math.prod(x.shape)).reshape(x.shape)
+        at = tuple(slice(k, k + n) for k, n in zip(numbers, update.shape, strict=True))
+        flat[at] = flat.size + np.arange(math.prod(update.shape)).reshape(update.shape)
+        firsts = np.array(
+            [0, math.prod(x.shape), math.prod(x.shape) + math.prod(update.shape)]
+        )
+        return [self.taken([x, update], firsts, flat, dtype)]
+    moving = [k for k, number in enumerate(numbers) if isinstance(number, Node)]
+    out = x
+    wide = [update.shape[k] for k in moving]
+    if math.prod(wide) > 64:
+        raise Unsupported("a slice that is written to computed places")
+    for within in np.ndindex(*wide):
+        # One place along each computed axis; the others are known.
+        index = [slice(None)] * len(x.shape)
+        at = [
+            slice(k, k + n) if not isinstance(k, Node) else slice(None)
+            for k, n in zip(numbers, update.shape, strict=True)
+        ]
+        for axis, k in zip(moving, within, strict=True):
+            index[axis] = slice(k, k + 1)
+        part = self.subarray(update, tuple(index))
+        target = list(x.shape)
+        for axis, k in enumerate(numbers):
+            if axis not in moving:
+                target[axis] = update.shape[axis]
+        spread = self.move(
+            jax.lax.broadcast_in_dim_p,
+            [part],
+            dict(
+                shape=tuple(target),
+                broadcast_dimensions=tuple(range(len(target))),
+                sharding=None,
+            ),
+        )[0]
+        masks = []
+        for axis, k in zip(moving, within, strict=True):
+            place = np.arange(x.shape[axis]).reshape(
+                [-1 if j == axis else 1 for j in range(len(target))]
+            )
+            masks.append(np.broadcast_to(place - k, tuple(target)))
+        starts_here = [numbers[axis] for axis in moving]
+
+        def rule(old, new, *places, starts_here=starts_here):
+            on: Number = True
+            for start, place in zip(starts_here, places, strict=True):
+                on = graph.op("and", "b1", (on, graph.compare("eq", "i8", start, place)))
+            return graph.select(dtype, on, new, old)
+
+        old = self.subarray(out, tuple(at))
+        new = self.map(rule, [old, spread, *masks], tuple(target), dtype)
+        out = new if tuple(target) == x.shape else self.replaced(out, new, tuple(at))
+    return [out]
+
+
+def gather(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
+    x, indices = values
+    params, dtype, out = eqn.params, dtype_of(x), eqn.outvars[0].aval
+    if isinstance(indices, np.ndarray) and is_inside(x, indices, **_shape_only(params)):
+        return self.moved_to_known(eqn.primitive, x, indices, params)
+    if out.size == 0:
+        return [np.zeros(out.shape, out.dtype)]
+    numbers, sizes, graph = params["dimension_numbers"], params["slice_sizes"], self.graph
+    joint = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
+    kept = [axis for axis in range(len(x.shape)) if axis not in joint]
+    strides = np.cumprod([1, *x.shape[:0:-1]])[::-1].tolist()
+    fills = jax.lax.GatherScatterMode.from_any(params["mode"]) == _FILLS
+    first, inside = _first_places(self, x, indices, params, strides, fills)
+    window = np.zeros([sizes[k] for k in kept], np.int64)
+    for k, axis in enumerate(kept):
+        shape = [-1 if j == k else 1 for j in range(len(kept))]
+        window = window + strides[axis] * np.arange(sizes[axis]).reshape(shape)
+    others = tuple(k for k in range(out.ndim) if k not in numbers.offset_dims)
+    spread = lambda value, dims: self.move(
+        jax.lax.broadcast_in_dim_p,
+        [value],
+        dict(shape=out.shape, broadcast_dimensions=dims, sharding=None),
+    )[0]
+    memory = self.cellar.contiguous(x)
+    start, filling = int(memory.places.ravel()[0]), _filling(params, dtype)
+
+    def taken(first, within, on):
+        offset = graph.add("i8", first, within)
+        if isinstance(offset, Node):
+            found = self.dynamic(start, 0, offset, dtype, 0, memory)
+        else:
+            found = self.cellar.number_at(start + offset, dtype)
+        return graph.select(dtype, on, found, filling) if fills else found
+
+    parts = [spread(first, others), spread(window, tuple(numbers.offset_dims))]
+    return [self.map(taken, [*parts, spread(inside, others)], out.shape, dtype)]
+
+
+def _first_places(
+    self: "Evaluation",
+    x: Value,
+    indices: Value,
+    params: Any,
+    strides: list[int],
+    fills: bool,
+) -> tuple[Value, Value]:
+    """The place of the first entry of each slice, and whether the slice lies inside."""
+    numbers, sizes, graph = params["dimension_numbers"], params["slice_sizes"], self.graph
+    before, of = indices.shape[:-1], dtype_of(indices)
+    first: Value = np.zeros(before, np.int64)
+    inside: Value = np.ones(before, bool)
+    for axis, along in zip(
+        numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True
+    ):
+        shape = [-1 if k == along else 1 for k in range(len(before))]
+        first = first + strides[axis] * np.arange(x.shape[axis]).reshape(shape)
+    for column, axis in enumerate(numbers.start_index_map):
+        own = self.subarray(indices, (..., slice(column, column + 1)))
+        own, high = self.reshaped(own, before), x.shape[axis] - sizes[axis]
+
+        def place(index, sofar, high=high, stride=strides[axis]):
+            index = _clamped(self, _whole_number(self, index, of), high)
+            return graph.add("i8", sofar, graph.multiply("i8", index, stride))
+
+        def is_in(index, sofar, high=high):
+            index = _whole_number(self, index, of)
+            for how, bound in (("ge", 0), ("le", high)):
+                now = graph.compare(how, "i8", index, bound)
+                sofar = graph.op("and", "b1", (sofar, now))
+            return sofar
+
+        first = self.map(place, [own, first], before, "i8")
+        if fills:
+            inside = self.map(is_in, [own, inside], before, "b1")
+    return first, inside
+
+
+def _shape_only(params: Any) -> Any:
+    return dict(
+        dimension_numbers=params["dimension_numbers"], slice_sizes=params["slice_sizes"]
+    )
+
+
+def _filling(params: Any, dtype: str) -> Number:
+    """What is found outside of an array."""
+    value = params.get("fill_value")
+    if value is not None:
+        return value
+    if dtype[0] == "f":
+        return float("nan")
+    if dtype[0] == "i":
+        return int(np.iinfo(dtype).min)
+    return int(np.iinfo(dtype).max) if dtype[0] == "u" else True
+
+
+def scatter(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
+    operand, index, updates = values
+    dtype, adds = dtype_of(operand), eqn.primitive.name == "scatter-add"
+    if eqn.params.get("update_jaxpr") is not None and not adds:
+        pass
+    size, count = math.prod(operand.shape), math.prod(updates.shape)
+    if count == 0:
+        return [operand]
+    if not isinstance(index, np.ndarray):
+        return [_scattered_to_computed(self, eqn, values)]
+    places = _places_of_updates(operand.shape, index, updates.shape, eqn.params)
+    if not adds:
+        source, falls = np.arange(size), places >= 0
+        source[places[falls]] = size + np.flatnonzero(falls)
+        firsts = np.array([0, size, size + count])
+        numbers = source.reshape(operand.shape)
+        return [self.taken([operand, updates], firsts, numbers, dtype)]
+    return [_added(self, operand, updates, places, dtype)]
+
+
+def _places_of_updates(
+    shape: tuple[int, ...], index: np.ndarray, update_shape: tuple[int, ...], params: Any
+) -> np.ndarray:
+    """The place in the flat array of each flat update; negative if it is dropped."""
+    dims, grid = params["dimension_numbers"], np.indices(update_shape)
+    windows, shared = dims.update_window_dims, dims.operand_batching_dims
+    at = [grid[k] for k in range(len(update_shape)) if k not in windows]
+    starts = index[tuple(at)]
+    skipped = (*dims.inserted_window_dims, *shared)
+    inner = [k for k in range(len(shape)) if k not in skipped]
+    first, within = np.zeros((2, len(shape), *update_shape), int)
+    room = np.array(shape) - 1
+    for axis, k in zip(inner, windows, strict=True):
+        within[axis] = grid[k]
+        room[axis] -= update_shape[k] - 1
+    for k, axis in enumerate(dims.scatter_dims_to_operand_dims):
+        first[axis] = starts[..., k]
+    for axis, k in zip(shared, dims.scatter_indices_batching_dims, strict=True):
+        first[axis] = at[k]
+    room = room.reshape(-1, *[1] * len(update_shape))
+    if params["mode"] == jax.lax.GatherScatterMode.CLIP:
+        first = np.clip(first, 0, room)
+    falls = np.all((first >= 0) & (first <= room), axis=0)
+    strides = np.cumprod([1, *shape[:0:-1]])[::-1]
+    places = np.tensordot(strides[: len(shape)], first + within, 1)
+    return np.where(falls, places, -1).ravel()
+
+
+def _added(self: "Evaluation", operand, updates, places, dtype) -> Value:
+    """Updates added to known places."""
+    size, count = math.prod(operand.shape), math.prod(updates.shape)
+    order = np.argsort(places, kind="stable")
+    order = order[places[order] >= 0]
+    to = places[order]
+    before = np.arange(to.size) - np.searchsorted(to, to)
+    repeats = int(before.max(initial=-1)) + 1
+    zero = np.zeros((1,), dtype)
+    firsts = np.array([0, count, count + 1])
+    # The few places with many updates, such as a body that all others are attached to, are
+    # added up by themselves: passes over all places would be many.
+    often = np.unique(to[before >= 8]) if repeats > 8 else to[:0]
+    is_often = np.isin(to, often)
+    out = operand
+    if often.size:
+        sums = []
+        for place in often:
+            own = self.taken([updates, zero], firsts, order[to == place], dtype)
+            sums.append(self.reshaped(self.total("add", own, (0,)), (1,)))
+        sums.append(zero)
+        total = self.move(jax.lax.concatenate_p, sums, dict(dimension=0))[0]
+        numbers = np.full(size, often.size)
+        numbers[often] = np.arange(often.size)
+        spread = self.taken(
+            [total], np.array([0, often.size + 1]), numbers.reshape(operand.shape), dtype
+        )
+        out = _sum(self, out, spread, dtype)
+    before, to, order = (x[~is_often] for x in (before, to, order))
+    for k in range(int(before.max(initial=-1)) + 1):
+        numbers = np.full(size, count)
+        numbers[to[before == k]] = order[before == k]
+        row = self.taken([updates, zero], firsts, numbers.reshape(operand.shape), dtype)
+        out = _sum(self, out, row, dtype)
+    return out
+
+
+def _sum(self: "Evaluation", a: Value, b: Value, dtype: str) -> Value:
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return a + b
+    if isinstance(a, np.ndarray) and not np.any(a):
+        return b
+    return self.map(lambda x, y: self.graph.add(dtype, x, y), [a, b], a.shape, dtype)
+
+
+def _scattered_to_computed(self: "Evaluation", eqn: Any, values: list[Value]) -> Value:
+    """Updates at computed places: every place asks whether an update is its own."""
+    operand, index, updates = values
+    params, graph, dtype = eqn.params, self.graph, dtype_of(operand)
+    dims = params["dimension_numbers"]
+    adds = eqn.primitive.name == "scatter-add"
+    if dims.operand_batching_dims:
+        raise Unsupported("a scatter with batch axes at computed places")
+    rows = index.shape[:-1]
+    count = math.prod(rows)
+    size = math.prod(operand.shape)
+    kept = [k for k in range(len(operand.shape)) if k not in dims.inserted_window_dims]
+    window = [updates.shape[k] for k in dims.update_window_dims]
+    mapped = dims.scatter_dims_to_operand_dims
+    if count * size > 8 * MOST_CELLS or any(
+        window[kept.index(axis)] != 1 for axis in mapped if axis in kept
+    ):
+        raise Unsupported("a scatter to computed places")
+    batch = [k for k in range(len(updates.shape)) if k not in dims.update_window_dims]
+    turned = self.move(
+        jax.lax.transpose_p,
+        [updates],
+        dict(permutation=(*batch, *dims.update_window_dims)),
+    )[0]
+    turned = self.reshaped(turned, (count, *window))
+    starts = self.cellar.unlaned(index).reshape(count, -1)
+    of, out = dtype_of(index), operand
+    clips = params["mode"] == jax.lax.GatherScatterMode.CLIP
+    for k in range(count):
+        part = self.subarray(turned, (slice(k, k + 1),))
+        full = [
+            1 if a in dims.inserted_window_dims else window[kept.index(a)]
+            for a in range(len(operand.shape))
+        ]
+        if any(n not in (1, m) for n, m in zip(full, operand.shape, strict=True)):
+            raise Unsupported("a scatter of windows to computed places")
+        part = self.reshaped(part, tuple(full))
+        part = self.move(
+            jax.lax.broadcast_in_dim_p,
+            [part],
+            dict(
+                shape=operand.shape,
+                broadcast_dimensions=tuple(range(len(full))),
+                sharding=None,
+            ),
+        )[0]
+        masks, numbers = [], []
+        for axis, entry in zip(mapped, starts[k].tolist(), strict=True):
+            entry = _whole_number(self, entry, of)
+            if clips:
+                entry = _clamped(self, entry, operand.shape[axis] - 1)
+            numbers.append(entry)
+            place = np.arange(operand.shape[axis]).reshape(
+                [-1 if j == axis else 1 for j in range(len(full))]
+            )
+            masks.append(np.broadcast_to(place, operand.shape))
+
+        def rule(old, new, *places, numbers=numbers):
+            on: Number = True
+            for number, place in zip(numbers, places, strict=True):
+                on = graph.op("and", "b1", (on, graph.compare("eq", "i8", number, place)))
+            new = graph.add(dtype, old, new) if adds else new
+            return graph.select(dtype, on, new, old)
+
+        out = self.map(rule, [out, part, *masks], operand.shape, dtype)
+    return out

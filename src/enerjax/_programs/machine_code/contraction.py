@@ -1,0 +1,108 @@
+"""Products of arrays: products of their entries, and sums of these."""
+
+import math
+from typing import Any, TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .values import Cells, dtype_of, type_name, Unsupported, Value
+
+
+if TYPE_CHECKING:
+    from .evaluation import Evaluation
+
+# The most products of numbers that are written out.
+_MOST_PRODUCTS = 2_000
+
+
+def contraction(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
+    """A product of arrays: products of entries, and their sums."""
+    (contracted_left, contracted_right), (batch_left, batch_right) = eqn.params[
+        "dimension_numbers"
+    ]
+    left, right = values
+    out = eqn.outvars[0].aval
+    terms = math.prod(left.shape[k] for k in contracted_left)
+    if out.size == 0 or terms == 0:
+        return [np.zeros(out.shape, out.dtype)]
+    dtype = type_name(out.dtype)
+    free = lambda x, a, b: [k for k in range(len(x.shape)) if k not in (*a, *b)]
+    free_left = free(left, contracted_left, batch_left)
+    free_right = free(right, contracted_right, batch_right)
+    shape = [
+        *(left.shape[k] for k in batch_left),
+        *(left.shape[k] for k in free_left),
+        *(right.shape[k] for k in free_right),
+        *(left.shape[k] for k in contracted_left),
+    ]
+    size = math.prod(shape)
+    lanes = [
+        x.n if isinstance(x, Cells) and x.lane is not None else 1 for x in (left, right)
+    ]
+    longest = max(max(shape), *lanes)
+    if size // longest > _MOST_PRODUCTS:
+        return [_large_product(self, eqn, values)]
+    nb, nl, nr, nc = map(len, (batch_left, free_left, free_right, contracted_left))
+    turn = lambda x, order: self.move(
+        jax.lax.transpose_p, [x], dict(permutation=tuple(order))
+    )[0]
+    left = turn(left, [*batch_left, *free_left, *contracted_left])
+    right = turn(right, [*batch_right, *free_right, *contracted_right])
+    spread = lambda x, dims: self.move(
+        jax.lax.broadcast_in_dim_p,
+        [x],
+        dict(shape=tuple(shape), broadcast_dimensions=tuple(dims), sharding=None),
+    )[0]
+    at = list(range(len(shape)))
+    left = spread(left, [*at[: nb + nl], *at[nb + nl + nr :]])
+    right = spread(right, [*at[:nb], *at[nb + nl : nb + nl + nr], *at[nb + nl + nr :]])
+    of = [dtype_of(left), dtype_of(right)]
+    rule = lambda a, b: self.graph.op(
+        "mul",
+        dtype,
+        (
+            self.graph.op("convert", dtype, (a,), of[0]),
+            self.graph.op("convert", dtype, (b,), of[1]),
+        ),
+    )
+    product = self.map(rule, [left, right], tuple(shape), dtype)
+    if nc == 0:
+        return [product]
+    return [self.total("add", product, tuple(at[nb + nl + nr :]))]
+
+
+def _large_product(self: "Evaluation", eqn: Any, values: list[Value]) -> Value:
+    """A product of large arrays, row by row in a loop."""
+    numbers = eqn.params["dimension_numbers"]
+    left, right = values
+    (contracted_left, _), (batch_left, _) = numbers
+    free = [k for k in range(len(left.shape)) if k not in (*contracted_left, *batch_left)]
+    if batch_left or not free:
+        if batch_left:
+            by_row = lambda a, b: jax.lax.map(
+                lambda x: jax.lax.dot_general(*x, _without_batch(numbers)),
+                (jnp.moveaxis(a, batch_left[0], 0), jnp.moveaxis(b, numbers[1][1][0], 0)),
+            )
+            if len(batch_left) > 1:
+                raise Unsupported("a product of large arrays with several batch axes")
+            return self.function(by_row, left, right)[0]
+        raise Unsupported("a product of very large arrays")
+    axis = free[0]
+    dims = tuple(k - (k > axis) for k in contracted_left)
+    inner = ((dims, numbers[0][1]), ((), ()))
+    place = 0
+
+    def by_row(a, b):
+        rows = jnp.moveaxis(a, axis, 0)
+        out = jax.lax.map(lambda row: jax.lax.dot_general(row, b, inner), rows)
+        return jnp.moveaxis(out, 0, place)
+
+    return self.function(by_row, left, right)[0]
+
+
+def _without_batch(numbers: Any) -> Any:
+    (left, right), (batch_left, batch_right) = numbers
+    less = lambda axes, batch: tuple(k - (k > batch[0]) for k in axes)
+    return (less(left, batch_left), less(right, batch_right)), ((), ())

@@ -1,0 +1,538 @@
+"""Programs as machine code: the values and derivatives of XLA, for lanes too."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.ad_checkpoint import checkpoint_name
+
+from enerjax._programs import at_places, in_one_function, why_not_one_function
+from enerjax._programs.machine_code import loops
+from enerjax._solvers.linear.dense import Inverse
+
+
+pytestmark = pytest.mark.skipif(
+    jax.default_backend() != "cpu", reason="machine code is for CPUs"
+)
+SMALL = jnp.linspace(0.15, 0.85, 6).reshape(2, 3)
+K = jnp.arange(1, 7).reshape(2, 3)
+
+
+def elementwise(x, k):
+    lax = jax.lax
+    bits = k.astype(jnp.uint64)
+    return [
+        *(f(x) for f in (jnp.abs, jnp.acos, jnp.asin, jnp.atan, jnp.asinh, jnp.atanh)),
+        *(f(x) for f in (jnp.ceil, jnp.floor, jnp.round, jnp.sign, jnp.cos, jnp.sin)),
+        *(f(x) for f in (jnp.tan, jnp.cosh, jnp.sinh, jnp.tanh, jnp.exp, jnp.exp2)),
+        *(f(x) for f in (jnp.expm1, jnp.log, jnp.log1p, jnp.sqrt, jnp.cbrt, lax.rsqrt)),
+        *(f(x) for f in (jnp.isfinite, jax.nn.sigmoid, lax.erf, lax.erfc)),
+        *(f(x) for f in (jnp.square, lax.neg)),
+        jnp.acosh(1 + x),
+        *(f(x, 1 - x) for f in (jnp.atan2, jnp.maximum, jnp.minimum, lax.rem, lax.div)),
+        *(f(x, 1 - x) for f in (jnp.nextafter, lax.eq, lax.ne, lax.lt, lax.le, lax.gt)),
+        *(f(x, 1 - x) for f in (lax.ge, lax.pow, lax.sub, lax.mul, lax.add)),
+        x**3,
+        lax.clamp(0.2, x, 0.6),
+        *(f(k, k + 1) for f in (lax.bitwise_and, lax.bitwise_or, lax.bitwise_xor)),
+        lax.bitwise_not(k),
+        *(f(bits, bits) for f in (lax.shift_left, lax.shift_right_logical)),
+        lax.shift_right_arithmetic(k, k),
+        k.astype(float),
+    ]
+
+
+def moves(x, k):
+    lax = jax.lax
+    i = k[0, 0] - 1
+    return [
+        jnp.concatenate([x, x]),
+        *(jnp.stack([x, 2 * x]), *jnp.unstack(x)),
+        lax.dynamic_slice(x, (i, i), (1, 2)),
+        lax.dynamic_update_slice(x, x[:1, :1], (i, i)),
+        *(jnp.expand_dims(x, 1), jnp.squeeze(x[:1]), x.T, x.reshape(-1), x[:, ::-1]),
+        *(x[:, jnp.array([2, 0])], x[i], lax.rev(x, (0,)), jnp.pad(x, 1)),
+        *jnp.split(x, [1], axis=1),
+        jnp.arange(6.0).reshape(2, 3) + x,
+        *(jnp.where(x > 0.5, x, -x), jnp.copy(x), lax.stop_gradient(x), jnp.diag(x[0])),
+        *(jnp.take(x, jnp.array([1, 0]), axis=0), jnp.tile(x, (2, 3))),
+    ]
+
+
+def sums(x, k):
+    return [
+        *(f(x, axis=1) for f in (jnp.sum, jnp.max, jnp.min, jnp.prod)),
+        *(f(x, axis=1) for f in (jnp.argmax, jnp.argmin)),
+        *(jnp.any(x > 0.5), jnp.all(k > 1), x @ x.T, x @ x[0], jnp.vdot(x, x)),
+        jnp.einsum("ij,kj->ik", x, x),
+    ]
+
+
+@jax.custom_jvp
+def _with_own_jvp(x):
+    return jnp.sin(x)
+
+
+_with_own_jvp.defjvp(lambda x, t: (_with_own_jvp(*x), t[0]))
+
+
+@jax.custom_vjp
+def _with_own_vjp(x):
+    return jnp.cos(x)
+
+
+_with_own_vjp.defvjp(lambda x: (jnp.cos(x), x), lambda x, t: (t,))
+
+
+@jax.custom_batching.custom_vmap
+def _with_own_vmap(x):
+    return 2 * x
+
+
+@_with_own_vmap.def_vmap
+def _(size, is_batched, x):
+    return 2 * x, True
+
+
+_kept = functools.partial(jax.checkpoint, prevent_cse=False)
+
+
+def _both(x, y):
+    return jnp.sin(x * y), x * y
+
+
+def calls(x, k):
+    lax = jax.lax
+    return [
+        *(_with_own_jvp(x), _with_own_vjp(x), _with_own_vmap(x), jax.jit(jnp.sin)(x)),
+        jax.checkpoint(jnp.sin)(x),
+        lax.platform_dependent(x, cpu=jnp.sin, default=jnp.cos),
+        jax.grad(lambda x: jnp.sum(x * x + jnp.sin(x)))(x),
+        jax.grad(lambda x: jnp.sum(jnp.diagonal(x[:, :2])))(x),
+        *(
+            checkpoint_name(x, "x"),
+            lax.optimization_barrier(x),
+            in_one_function(jnp.sin)(x),
+        ),
+        jax.grad(lambda x: jnp.sum(_kept(lambda x: lax.scan(_kept(_both), x[0], x)[1])(x)))(
+            x
+        ),
+        lax.while_loop(lambda c: c[0] < k[0, 1], lambda c: (c[0] + 1, 2 * c[1]), (0, x))[1],
+        lax.cond(k[0, 0] > 0, jnp.sin, jnp.cos, x),
+        lax.scan(lambda c, y: (c + y, c * y), x[0], x),
+        lax.fori_loop(0, 5, lambda n, c: c + n * x, x),
+    ]
+
+
+GROUPS = [elementwise, moves, sums, calls]
+
+
+def is_compiled(fn, *args):
+    """Whether a program calls a function of machine code."""
+    return "call @enerjax_" in jax.jit(fn).lower(*args).as_text()
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_operations(group):
+    out = in_one_function(group)
+    assert is_compiled(out, SMALL, K)
+    plain, whole = jax.jit(group)(SMALL, K), jax.jit(out)(SMALL, K)
+    for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(whole), strict=True):
+        # Round-off, of sums whose terms are of order one.
+        np.testing.assert_allclose(a, b, rtol=4e-15, atol=4e-15)
+
+
+NOT_POSSIBLE = {
+    "sort": lambda x: jnp.sort(jnp.tile(x[0], 20)),
+    "eigenvalues": lambda x: jnp.linalg.eigvalsh(x @ x.T + jnp.eye(2)),
+    "in a loop": lambda x: jax.lax.fori_loop(0, 3, lambda _, y: jnp.linalg.qr(y.T)[0].T, x),
+    "prints": lambda x: (x, jax.debug.print("x"))[0] + 1,
+    "random": lambda x: x + jax.random.uniform(jax.random.key((9 * x[0, 0]).astype(int))),
+}
+
+
+@pytest.mark.parametrize("name", NOT_POSSIBLE)
+def test_other_operations_are_compiled_by_xla(name):
+    fn = NOT_POSSIBLE[name]
+    left = in_one_function(fn)
+    assert not is_compiled(left, SMALL)
+    np.testing.assert_array_equal(jax.jit(left)(SMALL), jax.jit(fn)(SMALL))
+    (obstacle,) = why_not_one_function(fn, SMALL)
+    assert "test_machine_code.py" in obstacle
+
+
+# Programs -------------------------------------------------------------------------------
+
+X = jnp.sin(jnp.arange(1.0, 13.0)).reshape(3, 4)
+TWICE = np.array([2, 0, 2, 2])
+ROWS, COLUMNS = np.array([[0], [2]]), np.array([[3, 1], [0, 3]])
+OUTSIDE = np.array([-1, 7, 1, 4])
+MANY = np.array([0, 1, 0, 0, 2] * 4)
+
+
+def matrices(x, y, subscripts):
+    return jnp.einsum(subscripts, jnp.tile(x, (4, 3)), jnp.tile(y, (4, 3)))
+
+
+def large(x):
+    return jnp.tile(jnp.sin(x), (70, 11))[:, None] * jnp.ones((1, 2, 1), x.dtype)
+
+
+SUMS = (
+    lambda x, axis: jnp.sum(1e-3 * x, axis),
+    jnp.max,
+    jnp.min,
+    lambda x, axis: jnp.prod(1 + 1e-3 * x, axis),
+    lambda x, axis: jnp.all(x > -0.5, axis).astype(x.dtype),
+    lambda x, axis: jnp.any(x > 0.9, axis).astype(x.dtype),
+)
+AXES = (None, 0, 1, (0, 2), 2)
+
+
+def every_place(x):
+    """With shared axes, as `vmap` makes them."""
+    one = lambda row, k: row.at[k].add(row[:2])
+    return jax.vmap(one)(x, COLUMNS[[0, 1, 0]])
+
+
+def of_loops(x):
+    lax = jax.lax
+    add = lambda x: jnp.sin(x).at[:, TWICE].add(x)
+    turn = lambda c, y: (add(c), c[0].at[TWICE].set(y))
+    until = lambda c: (c[0] + jnp.zeros(9, int).at[TWICE].add(1)[0], add(c[1]))
+    return [
+        lax.scan(turn, x, x, reverse=True),
+        lax.scan(lambda c, _: (add(c), None), x, None, length=3)[0],
+        lax.while_loop(lambda c: c[0] < 3, until, (0, x)),
+        lax.cond(x[0, 0] > 0, add, jnp.cos, x),
+        lax.switch((9 * x[0, 0]).astype(int), [jnp.sin, add, jnp.cos], x),
+        jax.jit(add)(x),
+        jax.checkpoint(add)(x),
+        in_one_function(add)(x),
+    ]
+
+
+def sorting(x):
+    """With equal entries, which keep their order, and with entries that are no numbers."""
+    ties = jnp.round(2 * x)
+    broken = jnp.where(x > 0.9, jnp.nan, jnp.where(x < -0.9, jnp.inf, x))
+    return [
+        *(jnp.sort(x, axis=axis) for axis in (0, 1)),
+        *(jnp.argsort(y, axis=1) for y in (ties, -ties, broken)),
+        jax.lax.sort((ties, x), dimension=0, num_keys=1)[1],
+        jnp.argsort(TWICE + (4 * x[0]).astype(int)),
+    ]
+
+
+def definite(x):
+    return x @ x.T + jnp.eye(3)
+
+
+def factors(x):
+    square = x[:, :3] + jnp.array([[0.0, 2.0, 0.0], [0.0, 0.0, 3.0], [1.0, 0.0, 0.0]])
+    both = jnp.stack([square, square.T])
+    return [
+        jnp.linalg.cholesky(definite(x)),
+        jnp.linalg.det(both),
+        jnp.linalg.slogdet(square)[1],
+        jnp.linalg.inv(both),
+        jax.lax.linalg.lu(jnp.exp(x * x))[0],
+        *(y.astype(x.dtype) for y in jax.lax.linalg.lu(jnp.exp(x * x).T)),
+    ]
+
+
+def solutions(x):
+    lower, upper = jnp.tril(definite(x)), jnp.triu(definite(x))
+    solve = jax.scipy.linalg.solve_triangular
+    right = jax.lax.linalg.triangular_solve
+    return [
+        jnp.linalg.solve(x[:, :3] + 2 * jnp.eye(3)[::-1], x),
+        solve(lower, x, lower=True),
+        solve(upper, x, trans=1, unit_diagonal=True),
+        solve(upper, x[:, 0]),
+        right(lower, x.T, lower=True),
+        right(lower, x.T, lower=True, transpose_a=True),
+        jax.scipy.linalg.cho_solve((lower, True), x),
+    ]
+
+
+PROGRAMS = {
+    "put": lambda x: x.at[ROWS, COLUMNS].set(jnp.cos(x[:2, :2])),
+    "put twice": lambda x: x.at[:, TWICE].set(1 + 0 * x),
+    "add twice": lambda x: x.at[:, TWICE].add(jnp.cos(x)),
+    "add many times": lambda x: x.at[0, MANY].add(jnp.sin(jnp.tile(x[1], 10)[: MANY.size])),
+    "rows": lambda x: x.at[jnp.array([2, 0])].add(jnp.cos(x[:2])),
+    "windows": lambda x: x.at[1:, 1:3].add(x[:2, :2]).at[0].set(2.0),
+    "outside": lambda x: x.at[0, OUTSIDE].add(x[1]).at[2, OUTSIDE].set(x[1], mode="drop"),
+    "clipped": lambda x: x.at[0, OUTSIDE].add(x[1], mode="clip"),
+    "whole numbers": lambda x: x[0].astype(int).at[TWICE].add(3),
+    "places": every_place,
+    "long sums": lambda x: [f(large(x), axis) for f in SUMS for axis in AXES],
+    "running": lambda x: [
+        f(1 + 0.1 * x, axis=axis)
+        for f in (jnp.cumsum, jnp.cumprod, jax.lax.cummax, jax.lax.cummin)
+        for axis in (0, 1)
+    ],
+    "running back": lambda x: [jax.lax.cumsum(x, axis=1, reverse=True), jnp.cumsum(x[:0])],
+    "running far": lambda x: [
+        jnp.cumsum(jnp.tile(x, 5), 1),
+        jax.lax.cummax(jnp.asarray(TWICE)),
+    ],
+    "sorted": sorting,
+    "factors": factors,
+    "solutions": solutions,
+    "nothing": lambda x: (2 * x).at[np.zeros(0, int)].add(1.0),
+    "slope": jax.grad(lambda x: jnp.sum(jnp.sin(x[:, TWICE] * x) ** 2)),
+    "curvature": jax.hessian(lambda x: jnp.sum(jnp.sin(x[ROWS, COLUMNS]) ** 3)),
+    "matrices": lambda x: matrices(x, x, "ij,kj->ik"),
+    "transposed": lambda x: matrices(x, x.T[:3, :2], "ij,ik->jk"),
+    "long rows": lambda x: jnp.einsum("ij,jkl->ikl", x, jnp.tile(x[0, :, None, None], 4)),
+    "many matrices": lambda x: jnp.einsum("nij,nkj->nki", *[jnp.tile(x, (4, 3, 3))] * 2),
+    "loops": of_loops,
+}
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_values_and_derivatives(name):
+    fn = PROGRAMS[name]
+    other = in_one_function(fn)
+    assert is_compiled(other, X)
+
+    def seen(fn):
+        total = lambda x: sum(jnp.sum(jnp.sin(y)) for y in jax.tree.leaves(fn(x)))
+        # (A `while` has no reverse mode.)
+        reverse = jax.grad(total) if name != "loops" else jnp.sin
+        return fn(X), jax.jvp(fn, (X,), (jnp.cos(X),))[1], reverse(X)
+
+    # Round-off, of sums whose terms are of order one.
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-13)
+    float0 = jax.dtypes.float0
+    numbers = lambda tree: [x for x in jax.tree.leaves(tree) if x.dtype != float0]
+    jax.tree.map(close, numbers(jax.jit(lambda: seen(other))()), numbers(seen(fn)))
+
+
+@pytest.mark.parametrize(("num_pivots", "num_rows"), [(5, 9), (16, 16), (20, 40)])
+def test_the_order_of_rows_after_their_exchanges(num_pivots, num_rows):
+    rng = np.random.default_rng(0)
+    first = np.arange(num_pivots)
+    pivots = jnp.asarray(rng.integers(first, num_rows), jnp.int32)
+    expected = np.arange(num_rows)
+    for k, pivot in enumerate(np.asarray(pivots)):
+        expected[[k, pivot]] = expected[[pivot, k]]
+    order = lambda pivots: jax.lax.linalg.lu_pivots_to_permutation(pivots, num_rows)
+    assert not why_not_one_function(order, pivots)
+    np.testing.assert_array_equal(jax.jit(in_one_function(order))(pivots), expected)
+
+
+@pytest.mark.parametrize(
+    ("places", "operation"),
+    [
+        (np.arange(12), "no operation"),
+        (np.arange(2, 8).reshape(2, 3), "slice"),
+        (np.arange(1, 12, 3), "slice"),
+        (np.array([5]), "slice"),
+        (np.array([[3, 3], [0, 7]]), "gather"),
+        (np.array([4, 3, 2]), "gather"),
+        (np.zeros((2, 0), int), "slice"),
+    ],
+)
+def test_entries_at_known_places(places, operation):
+    x = jnp.arange(24.0).reshape(12, 2)
+    np.testing.assert_array_equal(at_places(x, places), np.asarray(x)[places])
+    program = jax.make_jaxpr(lambda x: at_places(x, places))(x)
+    names = {eqn.primitive.name for eqn in program.jaxpr.eqns}
+    assert names & {"slice", "gather"} == {operation} - {"no operation"}
+
+
+@pytest.mark.parametrize("rows", [8, 27])
+def test_inverses_are_renewed(rows):
+    start = Inverse(jnp.eye(rows))
+    change = jnp.sin(jnp.arange(1.0, 1 + rows**2)).reshape(rows, rows) / rows
+
+    def inverses(change):
+        matrix = lambda t: jnp.eye(rows) + 0.1 * t * change
+        turn = lambda kept, t: (kept.renewed(matrix(t)),) * 2
+        return jax.lax.scan(turn, start, jnp.arange(0.0, 5.0))[1].inverse
+
+    whole = in_one_function(inverses)
+    assert is_compiled(whole, change)
+    exact = np.linalg.inv(np.eye(rows) + 0.4 * np.asarray(change))
+    # Truncation: errors of 1e-7 are small enough for a chord iteration.
+    np.testing.assert_allclose(jax.jit(whole)(change)[-1], exact, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("rows", [20, 45])
+def test_factors_of_larger_matrices(rows):
+    rng = np.random.default_rng(rows)
+    matrix, right = rng.normal(size=(2, rows, rows))
+    definite = matrix @ matrix.T + np.eye(rows)
+    solve = jax.scipy.linalg.solve_triangular
+    fn = lambda a, d, b: (
+        jnp.linalg.solve(a, b),
+        jnp.linalg.cholesky(d),
+        solve(d, b, lower=True),
+        solve(d, b[:, 0], trans=1, unit_diagonal=True) / jnp.max(jnp.abs(d)) ** 9,
+        a @ b,
+    )
+    assert is_compiled(in_one_function(fn), matrix, definite, right)
+    found = jax.jit(in_one_function(fn))(matrix, definite, right)
+    for a, b in zip(found, jax.jit(fn)(matrix, definite, right), strict=True):
+        # Round-off, amplified by the condition of the matrices.
+        np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-8 * np.max(np.abs(b)))
+
+
+@pytest.mark.parametrize("length", [1000, 20000])
+def test_tables_that_are_looked_up(length):
+    table = np.sin(np.linspace(0, 1, length))
+
+    def follow(x):
+        """To places that the table tells."""
+        place = lambda x: jnp.floor(x * length).astype(int)
+        return jax.lax.fori_loop(0, 5, lambda _, x: jnp.asarray(table)[place(x)], x)
+
+    assert is_compiled(in_one_function(follow), 0.9)
+    assert jax.jit(in_one_function(follow))(0.9) == follow(0.9)
+
+
+def test_single_precision_and_whole_numbers():
+    def fn(x, k):
+        small = x.astype(jnp.float32)
+        counts = jax.lax.scan(lambda c, y: (c + y, c * y), k[0], k)
+        return jnp.sin(small) @ small.T, small.sum(), counts, k // (k - 2), k % 3, -k
+
+    found = jax.jit(in_one_function(fn))(X, K - 3)
+    for a, b in zip(
+        jax.tree.leaves(found), jax.tree.leaves(jax.jit(fn)(X, K - 3)), strict=True
+    ):
+        assert a.dtype == b.dtype
+        np.testing.assert_allclose(a, b, rtol=2e-6)  # round-off of single precision
+
+
+# Lanes ----------------------------------------------------------------------------------
+
+LANES = 18  # which is no multiple of the width of a vector
+
+
+def arithmetic(x, y):
+    matrix = jnp.outer(x, x) + jnp.diag(y)
+    return jnp.sin(x) @ matrix, jnp.max(x / y), x**3 - 1 / (1 + y**2), jnp.any(x > y)
+
+
+def computed_places(x, y):
+    first = jnp.argmax(x > 0.3)
+    chosen = jnp.where(x[0] > 0, 1, 2)
+    ordered = x.at[jnp.array([2, 0])].add(y[:2])[jnp.array([1, 2, 0])]
+    window = jax.lax.dynamic_slice(y, (chosen,), (1,))
+    return ordered, x[chosen], window, first, jnp.pad(x, (1, 2)), x[::-1].reshape(3, 1)
+
+
+def loops_of_lanes(x, y):
+    def halves(carry):
+        x, count = carry
+        return jnp.where(jnp.arange(3) == count, x, 0.5 * x), count + 1
+
+    small, count = jax.lax.while_loop(lambda c: jnp.max(c[0]) > 0.05, halves, (y, 0))
+    turn = lambda c, row: (jnp.cos(c) * row + x[0], c[:2])
+    end, rows = jax.lax.scan(turn, small, jnp.arange(4.0))
+    last = jax.lax.cond(x[1] > 0, lambda: end + 1, lambda: 2 * end)
+    return small, count, rows, last
+
+
+def tables_of_lanes(x, y):
+    row, column = jnp.where(x[0] > 0, 2, 1), jnp.where(y[0] > 0.5, 2, 0)
+    table, beyond = jnp.arange(9.0).reshape(3, 3), jnp.where(x > 0, 1, 4)
+    filled = [
+        values.at[beyond].get(mode="fill", fill_value=other)
+        for values in (y, jnp.arange(3), jnp.arange(3, dtype=jnp.uint8), y > 0.5)
+        for other in (None, 1)
+    ]
+    one_axis = jax.lax.dynamic_slice(table, (row, 5), (1, 1))
+    return table[row, 1], table[2, column], one_axis, filled
+
+
+def running_sums(x, y):
+    table = jnp.stack([x, y, x * y])
+    back = jax.lax.cumsum(table, axis=1, reverse=True)
+    return jnp.cumsum(table, axis=0), jnp.cumprod(table, axis=1), back, jax.lax.cummin(x)
+
+
+def factors_of_lanes(x, y):
+    matrix = jnp.diag(4 + y) + x[:, None] * jnp.roll(x, 1)[None] / 9
+    definite = matrix @ matrix.T
+    root = jnp.linalg.cholesky(definite)
+    half = jax.scipy.linalg.solve_triangular(root, x, lower=True)
+    return root, half, jnp.linalg.solve(matrix, y), jnp.sort(x), jnp.linalg.inv(definite)
+
+
+def long_rows(x, y):
+    """With arrays that have lanes of their own, in loops that each lane leaves by itself."""
+    table = jnp.outer(jnp.linspace(0.1, 1, 20), x)
+
+    def turn(carry):
+        k, rows, kept = carry
+        rows = jnp.where(k % 2 == 0, rows[::-1] * 0.9, jnp.cos(rows + y[0]))
+        return k + 1, rows, kept.at[k].set(jnp.max(rows))
+
+    count, rows, kept = jax.lax.while_loop(
+        lambda c: (c[0] < 6) & (jnp.max(c[1]) > 0.3 * y[1]), turn, (0, table, jnp.zeros(6))
+    )
+    several = jax.lax.scan(lambda c, row: (c * 0.5 + row, c[:2]), rows[0], rows)
+    return count, rows.sum(axis=0), kept, several, jnp.roll(table[:, 1], 3) @ rows[:, 0]
+
+
+OF_LANES = [
+    arithmetic,
+    computed_places,
+    loops_of_lanes,
+    tables_of_lanes,
+    running_sums,
+    factors_of_lanes,
+    long_rows,
+]
+
+
+@pytest.mark.parametrize("written_out", [0, 150])
+@pytest.mark.parametrize("fn", OF_LANES, ids=lambda fn: fn.__name__)
+def test_lanes_equal_single_calls(fn, written_out, monkeypatch):
+    """Shared inputs, too. The differences are round-off: sums have another order."""
+    monkeypatch.setattr(loops, "_WRITTEN_OUT", written_out)
+    rng = np.random.default_rng(3)
+    x, y = jnp.asarray(rng.normal(size=(2, LANES, 3)))
+    y = jnp.abs(y) + 0.1
+    for shared in (False, True):
+        axes, ys = (0, None if shared else 0), y[0] if shared else y
+        batch = jax.vmap(in_one_function(fn), in_axes=axes)
+        assert is_compiled(batch, x, ys)
+        found = jax.jit(batch)(x, ys)
+        expected = jax.vmap(fn, in_axes=axes)(x, ys)
+        close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-13)
+        jax.tree.map(close, found, expected)
+
+
+def test_lanes_have_their_own_iterations():
+    """And each is as it is alone, to the bit."""
+
+    def turn(carry):
+        turns, x = carry
+        return turns + 1, jnp.sin(x) + x
+
+    count = lambda x: jax.lax.while_loop(lambda c: c[0] < x[0, 0], turn, (0.0, x))
+    whole, xs = in_one_function(count), jnp.arange(12000.0).reshape(2000, 2, 3) / 3000
+    turns, ends = jax.jit(jax.vmap(whole))(xs)
+    for lane in (0, 7, 1999):
+        alone = jax.jit(whole)(xs[lane])
+        assert turns[lane] == alone[0] == np.ceil(xs[lane, 0, 0])
+        np.testing.assert_array_equal(ends[lane], alone[1])
+
+
+@pytest.mark.slow
+def test_results_of_many_lanes_are_computed_in_chunks(monkeypatch):
+    from enerjax._programs.machine_code import calls
+
+    monkeypatch.setattr(calls, "_MOST_OF_LANES", 50)
+    xs = jnp.arange(57.0).reshape(19, 3)
+    fn = lambda x: (jnp.sin(x), x.sum())
+    found = jax.jit(jax.vmap(in_one_function(fn)))(xs)
+    jax.tree.map(np.testing.assert_array_equal, found, jax.jit(jax.vmap(fn))(xs))
