@@ -467,7 +467,7 @@ def factors_of_lanes(x, y):
 
 
 def long_rows(x, y):
-    """With arrays that have lanes of their own, in loops that each lane leaves by itself."""
+    """With arrays that have lanes of their own, in loops that each lane leaves alone."""
     table = jnp.outer(jnp.linspace(0.1, 1, 20), x)
 
     def turn(carry):

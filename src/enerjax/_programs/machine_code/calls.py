@@ -1,8 +1,8 @@
 """A primitive of JAX that runs a program as one function of machine code, on CPUs.
 
 On other processors, and where an operation has no machine code here, XLA compiles the
-program. The values are the same, but for round-off. Derivatives of a program are programs of
-this kind too; `jax.checkpoint` decides which values they keep.
+program. The values are the same, but for round-off. Derivatives of a program are programs
+of this kind too; `jax.checkpoint` decides which values they keep.
 """
 
 import functools
@@ -110,10 +110,10 @@ class Program:
     def __call__(self, numbers: Sequence[Array]) -> list[Array]:
         """The outputs, computed by operations of JAX."""
         pairs = zip(numbers, self.known, strict=True)
-        numbers = [x if known is None else known for x, known in pairs]
+        values = [x if known is None else known for x, known in pairs]
         count = len(self.jaxpr.constvars)
-        closed = ClosedJaxpr(self.jaxpr, list(numbers[:count]))
-        return jaxpr_as_fun(closed)(*numbers[count:])
+        closed = ClosedJaxpr(self.jaxpr, values[:count])
+        return jaxpr_as_fun(closed)(*values[count:])
 
     def run(self, numbers: Sequence[Array]) -> list[Array]:
         """The outputs, computed by machine code where that is possible."""
@@ -125,7 +125,7 @@ class Program:
         like = [
             jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in self.jaxpr.outvars
         ]
-        return jax.ffi.ffi_call(function.name, like)(*taken)
+        return list(jax.ffi.ffi_call(function.name, like)(*taken))
 
 
 def run_closed(

@@ -1,4 +1,4 @@
-"""Entries at places that are computed while a program runs, and sums of entries at places."""
+"""Entries at places that are computed while a program runs, and at known places."""
 
 import math
 from collections.abc import Sequence
@@ -54,83 +54,51 @@ def _at_computed(
     return self.cells(dtype, objects(flat, tuple(kept)), lane, n)
 
 
+def _starts(
+    self: "Evaluation", starts: list[Value], shape: Sequence[int], sizes: Sequence[int]
+) -> list[Number]:
+    """Where a slice begins, moved such that it lies inside."""
+    numbers = (
+        _whole_number(self, self.cellar.unlaned(x).item(), dtype_of(x)) for x in starts
+    )
+    triples = zip(numbers, shape, sizes, strict=True)
+    return [_clamped(self, x, length - size) for x, length, size in triples]
+
+
 def dynamic_slice(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
-    x, *starts = values
-    sizes = eqn.params["slice_sizes"]
-    numbers = [
-        _clamped(
-            self, _whole_number(self, self.cellar.unlaned(s).item(), dtype_of(s)), n - k
-        )
-        for s, n, k in zip(starts, x.shape, sizes, strict=True)
-    ]
-    return [_at_computed(self, x, numbers, sizes)]
+    (x, *starts), sizes = values, eqn.params["slice_sizes"]
+    return [_at_computed(self, x, _starts(self, starts, x.shape, sizes), sizes)]
 
 
 def dynamic_update_slice(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
+    """Every place asks whether it lies in the slice, and then reads from the update."""
     x, update, *starts = values
     graph, dtype = self.graph, dtype_of(x)
     if math.prod(update.shape) == 0:
         return [x]
-    numbers = [
-        _clamped(
-            self, _whole_number(self, self.cellar.unlaned(s).item(), dtype_of(s)), n - k
-        )
-        for s, n, k in zip(starts, x.shape, update.shape, strict=True)
-    ]
-    if not any(isinstance(k, Node) for k in numbers):
-        flat = np.arange(math.prod(x.shape)).reshape(x.shape)
-        at = tuple(slice(k, k + n) for k, n in zip(numbers, update.shape, strict=True))
-        flat[at] = flat.size + np.arange(math.prod(update.shape)).reshape(update.shape)
-        firsts = np.array(
-            [0, math.prod(x.shape), math.prod(x.shape) + math.prod(update.shape)]
-        )
-        return [self.taken([x, update], firsts, flat, dtype)]
-    moving = [k for k, number in enumerate(numbers) if isinstance(number, Node)]
-    out = x
-    wide = [update.shape[k] for k in moving]
-    if math.prod(wide) > 64:
-        raise Unsupported("a slice that is written to computed places")
-    for within in np.ndindex(*wide):
-        # One place along each computed axis; the others are known.
-        index = [slice(None)] * len(x.shape)
-        at = [
-            slice(k, k + n) if not isinstance(k, Node) else slice(None)
-            for k, n in zip(numbers, update.shape, strict=True)
-        ]
-        for axis, k in zip(moving, within, strict=True):
-            index[axis] = slice(k, k + 1)
-        part = self.subarray(update, tuple(index))
-        target = list(x.shape)
-        for axis, k in enumerate(numbers):
-            if axis not in moving:
-                target[axis] = update.shape[axis]
-        spread = self.move(
-            jax.lax.broadcast_in_dim_p,
-            [part],
-            dict(
-                shape=tuple(target),
-                broadcast_dimensions=tuple(range(len(target))),
-                sharding=None,
-            ),
-        )[0]
-        masks = []
-        for axis, k in zip(moving, within, strict=True):
-            place = np.arange(x.shape[axis]).reshape(
-                [-1 if j == axis else 1 for j in range(len(target))]
-            )
-            masks.append(np.broadcast_to(place - k, tuple(target)))
-        starts_here = [numbers[axis] for axis in moving]
+    begins = _starts(self, starts, x.shape, update.shape)
+    memory = self.cellar.contiguous(update)
+    first = int(memory.places.ravel()[0])
+    strides = np.cumprod([1, *update.shape[:0:-1]])[::-1].tolist()
 
-        def rule(old, new, *places, starts_here=starts_here):
-            on: Number = True
-            for start, place in zip(starts_here, places, strict=True):
-                on = graph.op("and", "b1", (on, graph.compare("eq", "i8", start, place)))
-            return graph.select(dtype, on, new, old)
+    def rule(old: Number, *places: Number) -> Number:
+        offset: Number = 0
+        inside: Number = True
+        axes = zip(places, begins, update.shape, strides, strict=True)
+        for place, begin, size, stride in axes:
+            within = graph.op("sub", "i8", (place, begin))
+            for how, bound in (("ge", 0), ("lt", size)):
+                now = graph.compare(how, "i8", within, bound)
+                inside = graph.op("and", "b1", (inside, now))
+            within = _clamped(self, within, size - 1)
+            offset = graph.add("i8", offset, graph.multiply("i8", within, stride))
+        if isinstance(offset, Node):
+            new = self.dynamic(first, 0, offset, dtype, 0, memory)
+        else:
+            new = self.cellar.number_at(first + int(offset), dtype)
+        return graph.select(dtype, inside, new, old)
 
-        old = self.subarray(out, tuple(at))
-        new = self.map(rule, [old, spread, *masks], tuple(target), dtype)
-        out = new if tuple(target) == x.shape else self.replaced(out, new, tuple(at))
-    return [out]
+    return [self.map(rule, [x, *np.indices(x.shape)], x.shape, dtype)]
 
 
 def gather(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
@@ -164,7 +132,7 @@ def gather(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
         if isinstance(offset, Node):
             found = self.dynamic(start, 0, offset, dtype, 0, memory)
         else:
-            found = self.cellar.number_at(start + offset, dtype)
+            found = self.cellar.number_at(start + int(offset), dtype)
         return graph.select(dtype, on, found, filling) if fills else found
 
     parts = [spread(first, others), spread(window, tuple(numbers.offset_dims))]

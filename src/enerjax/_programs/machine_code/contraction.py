@@ -6,6 +6,7 @@ from typing import Any, TYPE_CHECKING
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .values import Cells, dtype_of, type_name, Unsupported, Value
 
@@ -76,30 +77,23 @@ def contraction(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value
 def _large_product(self: "Evaluation", eqn: Any, values: list[Value]) -> Value:
     """A product of large arrays, row by row in a loop."""
     numbers = eqn.params["dimension_numbers"]
-    left, right = values
-    (contracted_left, _), (batch_left, _) = numbers
-    free = [k for k in range(len(left.shape)) if k not in (*contracted_left, *batch_left)]
-    if batch_left or not free:
-        if batch_left:
-            by_row = lambda a, b: jax.lax.map(
-                lambda x: jax.lax.dot_general(*x, _without_batch(numbers)),
-                (jnp.moveaxis(a, batch_left[0], 0), jnp.moveaxis(b, numbers[1][1][0], 0)),
-            )
-            if len(batch_left) > 1:
-                raise Unsupported("a product of large arrays with several batch axes")
-            return self.function(by_row, left, right)[0]
-        raise Unsupported("a product of very large arrays")
-    axis = free[0]
-    dims = tuple(k - (k > axis) for k in contracted_left)
-    inner = ((dims, numbers[0][1]), ((), ()))
-    place = 0
+    (contracted, of_right), (batch, right_batch) = numbers
+    left, _ = values
+    free = [k for k in range(len(left.shape)) if k not in (*contracted, *batch)]
+    if len(batch) > 1 or not (batch or free):
+        raise Unsupported("a product of large arrays")
 
-    def by_row(a, b):
-        rows = jnp.moveaxis(a, axis, 0)
-        out = jax.lax.map(lambda row: jax.lax.dot_general(row, b, inner), rows)
-        return jnp.moveaxis(out, 0, place)
+    def by_batch(a: Array, b: Array) -> Array:
+        product = lambda x: jax.lax.dot_general(x[0], x[1], _without_batch(numbers))
+        first = jnp.moveaxis(a, batch[0], 0), jnp.moveaxis(b, right_batch[0], 0)
+        return jax.lax.map(product, first)
 
-    return self.function(by_row, left, right)[0]
+    def by_row(a: Array, b: Array) -> Array:
+        axes = tuple(k - (k > free[0]) for k in contracted)
+        product = lambda row: jax.lax.dot_general(row, b, ((axes, of_right), ((), ())))
+        return jax.lax.map(product, jnp.moveaxis(a, free[0], 0))
+
+    return self.function(by_batch if batch else by_row, *values)[0]
 
 
 def _without_batch(numbers: Any) -> Any:

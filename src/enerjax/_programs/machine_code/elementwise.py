@@ -6,8 +6,8 @@ from typing import TypeAlias
 from .graph import as_number, FUNCTIONS, Graph, Number
 
 
-# Called with the graph, the parameters of the equation, the type of the result, those of the
-# operands, and the operands.
+# Called with the graph, the parameters of the equation, the type of the result, those of
+# the operands, and the operands.
 Rule: TypeAlias = Callable[..., Number]
 
 

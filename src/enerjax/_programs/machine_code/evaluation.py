@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.extend.core import Literal
 
 from ..jaxprs import programs_within, solution_program, wrapped_program
@@ -86,8 +87,9 @@ class Evaluation:
 
     def joined(self, parts: list[Value]) -> Value:
         """Arrays one after the other, along the first axis."""
-        if all(isinstance(x, np.ndarray) for x in parts):
-            return np.concatenate(parts)
+        known = [x for x in parts if isinstance(x, np.ndarray)]
+        if len(known) == len(parts):
+            return np.concatenate(known)
         return self.move(jax.lax.concatenate_p, parts, dict(dimension=0))[0]
 
     def closed(self, closed: Any, args: Sequence[Any]) -> list[Value]:
@@ -432,13 +434,6 @@ class Evaluation:
         firsts = np.array([0, math.prod(value.shape)])
         return self.taken([value], firsts, numbers, dtype_of(value))
 
-    def replaced(self, value: Value, part: Value, index: Any) -> Value:
-        size = math.prod(value.shape)
-        numbers = np.arange(size).reshape(value.shape)
-        numbers[index] = size + np.arange(math.prod(part.shape)).reshape(part.shape)
-        firsts = np.array([0, size, size + math.prod(part.shape)])
-        return self.taken([value, part], firsts, numbers, dtype_of(value))
-
     def reshaped(self, value: Value, shape: tuple[int, ...]) -> Value:
         if isinstance(value, np.ndarray):
             return value.reshape(shape)
@@ -499,7 +494,7 @@ def known_constant(x: Any) -> Value:
     """A constant of a program, whose numbers are known."""
     if isinstance(x, Cells | Memory):
         return x
-    if isinstance(x, jax.core.Tracer):
+    if isinstance(x, Tracer):
         raise Unsupported("a constant that is not known")
     return np.asarray(x)
 
@@ -560,7 +555,7 @@ def _running(self: Evaluation, eqn: Any, values: list[Value]) -> list[Value]:
 
         def by_loop(x):
             x = jnp.moveaxis(x, axis, 0)
-            turn = lambda c, row: (of_two(c, row),) * 2
+            turn = lambda c, row: (of_two(c, row), of_two(c, row))
             first = x[-1] if reverse else x[0]
             rest = x[:-1] if reverse else x[1:]
             _, out = jax.lax.scan(turn, first, rest, reverse=reverse)

@@ -1,10 +1,10 @@
 """The scalar operations of a program, as a graph.
 
-A node stands for one number, or for one number of each of `n` lanes (the entries of an array
-along its longest axis). A number that is known while the program is traced is a Python
-number instead, and operations with zeros, ones and known numbers are left out. So is a
-product with zero whose other factor might be infinite or NaN: what multiplies a structural
-zero has no influence. Equal operations on equal operands are one node.
+A node stands for one number, or for one number of each of `n` lanes (the entries of an
+array along its longest axis). A number that is known while the program is traced is a
+Python number instead, and operations with zeros, ones and known numbers are left out. So is
+a product with zero whose other factor might be infinite or NaN: what multiplies a
+structural zero has no influence. Equal operations on equal operands are one node.
 """
 
 import math
@@ -228,7 +228,11 @@ def _shift_right_signed(a: Any, b: Any, size: int) -> Any:
     return np.right_shift(a, np.clip(b, 0, size - 1))
 
 
-_SHIFTS = {"shl": _shift_left, "lshr": _shift_right, "ashr": _shift_right_signed}
+_SHIFTS: dict[str, Callable[..., Any]] = {
+    "shl": _shift_left,
+    "lshr": _shift_right,
+    "ashr": _shift_right_signed,
+}
 _COMPARE: dict[str, Callable[[Any, Any], Any]] = {
     "eq": lambda a, b: a == b,
     "ne": lambda a, b: a != b,

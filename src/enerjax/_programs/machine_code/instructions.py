@@ -279,7 +279,7 @@ class Instructions:
         return f"splat ({kind} {text})" if self.vector > 1 else text
 
 
-def literal(x: Number, dtype: str) -> str:
+def literal(x: Any, dtype: str) -> str:
     """A known number in the language of LLVM."""
     if dtype[0] == "f":
         number = float(x)

@@ -1,10 +1,11 @@
 """Kernels: operations of one region, level and number of lanes, as a function.
 
-A kernel of lanes is a loop over them, which takes several at a time. In a region whose passes
-are independent, such as the lanes of a batch, every number is a vector over several passes,
-in a memory of its own.
+A kernel of lanes is a loop over them, which takes several at a time. In a region whose
+passes are independent, such as the lanes of a batch, every number is a vector over several
+passes, in a memory of its own.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, TYPE_CHECKING
 
@@ -182,7 +183,7 @@ class Kernel(Instructions):
     def _read(self, x: Node) -> str:
         if x.lanes and not x.is_reduced:
             assert x.lanes == self.lanes
-            extra = x.extra if x.op == "load" else (x.place, 1, None)
+            extra: Any = x.extra if x.op == "load" else (x.place, 1, None)
             return self._lanes_at(x.dtype, *extra)
         place = x.extra if x.op == "load" else x.place
         assert place is not None
@@ -276,7 +277,8 @@ class Kernel(Instructions):
             self.lines.append(f"  store {kind} {one}, ptr {pointer}, align 8")
 
     def _store(self, node: Node) -> None:
-        (x, *counter), dtype = node.operands, node.dtype
+        (x, *rest), dtype = node.operands, node.dtype
+        counter = [x for x in rest if isinstance(x, Node)]
         first, stride, table, row, mask = node.extra
         value = self._value(x, dtype)
         if self.is_wide:
@@ -456,7 +458,8 @@ class Recurrence(Kernel):
     def text(self, name: str) -> str:
         item, firsts = self.item, {}
         for place, node in self.commits.items():
-            firsts[place] = self._before(lambda: self._number_at(place, node.dtype))
+            first = functools.partial(self._number_at, place, node.dtype)
+            firsts[place] = self._before(first)
             self.carry[place] = self._new()
         for node in self.nodes:
             if node.op != "store":

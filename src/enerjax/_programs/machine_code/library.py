@@ -282,7 +282,8 @@ answer:
   ret ptr null
 work:
   %m = call ptr @malloc(i64 $SIZE$)
-  call void @llvm.memcpy.p0.p0.i64(ptr %m, ptr inttoptr (i64 $C$ to ptr), i64 $CONSTANTS$, i1 false)
+  %c = inttoptr i64 $C$ to ptr
+  call void @llvm.memcpy.p0.p0.i64(ptr %m, ptr %c, i64 $CONSTANTS$, i1 false)
   %w = call ptr @malloc(i64 $WIDE$)
   call void @widened(ptr %m, ptr %w, i64 $NUMBER$)
   %f0 = getelementptr i8, ptr %frame, i64 72
@@ -300,7 +301,7 @@ $COPIES_OUT$
 
 
 class _Library:
-    """The compiled functions of this process, which stay for its life: XLA may call them."""
+    """The compiled functions of this process. They stay, because XLA may call them."""
 
     def __init__(self):
         import llvmlite.binding as llvm
