@@ -8,7 +8,6 @@ import pytest
 import enerjax as ej
 
 from .helpers import EPS, problem
-from .test_one_function import pytestmark  # noqa: F401
 
 
 def explained(name, scheme: Any = ej.EnergyPreserving()):
@@ -67,14 +66,6 @@ def test_operations_of_the_user_are_named_with_their_lines():
     assert "test_explain.py" in of_eigh
     assert "force" in of_eigh
     assert "because of\n" in str(found)
-
-
-def test_a_step_of_too_many_operations_is_no_single_function():
-    long_sum = lambda q, args: sum(jnp.sin(k * q[0]) for k in range(1, 60)) + q @ q
-    start = ej.State([1.0, 0.5], [0.0, 0.0])
-    system = ej.System(jnp.eye(2), long_sum)
-    (obstacle,) = ej.explain(system, ej.EnergyPreserving(), start).obstacles
-    assert obstacle.startswith("its length")
 
 
 def test_a_chain_is_eliminated_block_by_block():

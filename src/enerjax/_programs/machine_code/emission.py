@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from .graph import Node, Number, Region
+from .graph import Node, NOT_COMPUTED, Number, Region
 from .kernels import Kernel, Recurrence, recurrences, WIDTH
 from .loops import Scan, While
 from .values import Cellar, CONSTANTS
@@ -85,7 +85,7 @@ class Emission:
         for key, nodes in kernels.items():
             for node in nodes:
                 for x in node.operands:
-                    if not isinstance(x, Node) or x.op in ("load", "marker"):
+                    if not isinstance(x, Node) or x.op in NOT_COMPUTED:
                         continue
                     if x.region is node.region and x.region in loops:
                         continue
@@ -290,7 +290,7 @@ def _kernels(regions: list[Region]) -> dict[tuple, list[Node]]:
         live.add(node)
         stack.extend(x for x in node.operands if isinstance(x, Node) and x not in live)
     order = {region: k for k, region in enumerate(regions)}
-    needed = [x for x in live if x.op not in ("load", "marker") and x.region in order]
+    needed = [x for x in live if x.op not in NOT_COMPUTED and x.region in order]
     needed.sort(key=lambda x: (order[x.region], x.level, x.lanes, x.number))
     kernels: dict[tuple, list[Node]] = {}
     for node in needed:

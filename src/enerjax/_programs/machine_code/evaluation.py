@@ -158,6 +158,10 @@ class Evaluation:
         if size == 0:
             return np.zeros(shape, dtype)
         values = [self._spread(x, shape) if x.shape else x for x in values]
+        rows = self.rows_of.get(size) if len(shape) == 1 else None
+        if rows is not None:
+            values = [self.reshaped(x, rows) if x.shape else x for x in values]
+            return self.reshaped(self.map(rule, values, rows, dtype), shape)
         lane = lane_of(values, shape)
         if lane is not None and size // shape[lane] > MOST_CELLS:
             return self._as_one_axis(rule, values, shape, dtype)

@@ -14,6 +14,10 @@ from typing import Any, TypeAlias
 import numpy as np
 
 
+# These are no operations of a kernel, but read by each that needs them.
+NOT_COMPUTED = frozenset(("lane", "load", "marker"))
+
+
 class Region:
     """A part of a program that is run as a whole: a body, a branch, or what is around.
 

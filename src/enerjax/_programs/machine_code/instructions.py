@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from .graph import Node, Number
+from .graph import Node
 
 
 TYPES = {

@@ -181,6 +181,8 @@ class Kernel(Instructions):
         return self.names[x]
 
     def _read(self, x: Node) -> str:
+        if x.op == "lane":
+            return self._lane_numbers()
         if x.lanes and not x.is_reduced:
             assert x.lanes == self.lanes
             extra: Any = x.extra if x.op == "load" else (x.place, 1, None)
@@ -188,6 +190,13 @@ class Kernel(Instructions):
         place = x.extra if x.op == "load" else x.place
         assert place is not None
         return self._before(lambda: self._number_at(place, x.dtype))
+
+    def _lane_numbers(self) -> str:
+        """The numbers of the lanes that are taken."""
+        if self.step == 1:
+            return self._spread("%i", "i64")
+        numbers = ", ".join(f"i64 {k}" for k in range(self.vector))
+        return self._say(f"add {self._t('i8')} {self._spread('%i', 'i64')}, <{numbers}>")
 
     def _number_at(self, place: int, dtype: str) -> str:
         if self._has_passes(place):

@@ -104,7 +104,8 @@ def _function(cellar: Cellar, inputs: list, outputs: list) -> Function:
     constants = np.concatenate([np.zeros(0, np.int64), *cellar.constants])
     # Tables of distances have no constants' cells.
     tables = [emission.addresses(x) if np.any(x >= CONSTANTS) else x for x in cellar.tables]
-    size = 8 * (cellar.num_constants + cellar.size)
+    # One more, because kernels may read the cell behind a number.
+    size = 8 * (cellar.num_constants + cellar.size + 1)
     handler = _HANDLER.replace("$SIZE$", str(max(size, 8)))
     handler = handler.replace(
         "$WIDE$", str(max(WIDTH * size, 8) if emission.has_passes else 8)

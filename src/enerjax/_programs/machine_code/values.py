@@ -105,7 +105,8 @@ class Cellar:
 
     def __init__(self, graph: Graph):
         self.graph = graph
-        self.size = 0
+        # The first cell is not used: kernels may read the one before a number.
+        self.size = 1
         self._starts: list[int] = []
         self._owners: list[Node | Block] = []
         self.constants: list[np.ndarray] = []
@@ -246,11 +247,34 @@ class Cellar:
             if isinstance(owner, Node) and is_affine and stride == 1:
                 if owner.place == first and owner.lanes == n and not owner.is_reduced:
                     return owner
-        region, level, markers = self._readable(owners)
-        extra = (first, stride, None)
         if not is_affine:
-            extra = self.scattered(places)
+            shifted = self._shifted(places, steps, dtype)
+            if shifted is not None:
+                return shifted
+        region, level, markers = self._readable(owners)
+        extra = (first, stride, None) if is_affine else self.scattered(places)
         return self.graph.at(region, level, "load", dtype, markers, extra, n)
+
+    def _shifted(self, places: np.ndarray, steps: np.ndarray, dtype: str) -> Number | None:
+        """Neighbouring cells but for the first lane or the last one, which are elsewhere.
+
+        All are read at once, and those of the ends are replaced.
+        """
+        if places.size < 8 or not np.all(steps[1:-1] == 1):
+            return None
+        inner = places[1:-1]
+        whole = np.arange(inner[0] - 1, inner[-1] + 2)
+        # The cell before the first one belongs to another number, which is not used.
+        region, level, markers = self._readable(self._all_owners(inner))
+        extra = (int(whole[0]), 1, None)
+        x: Number = self.graph.at(region, level, "load", dtype, markers, extra, places.size)
+        lane = self.graph.at(self.graph.root, 0, "lane", "i8", lanes=places.size)
+        for end in (0, places.size - 1):
+            if places[end] != whole[end]:
+                is_end = self.graph.compare("eq", "i8", lane, end)
+                other = self.number_at(int(places[end]), dtype)
+                x = self.graph.select(dtype, is_end, other, x)
+        return x
 
     def of_one_memory(self, places: np.ndarray, dtype: str) -> np.ndarray:
         """The cells, or copies, such that all or none have a number for each pass."""
@@ -300,7 +324,7 @@ class Cellar:
 
         A column is a number of many lanes, of which the array has all. Returned are the
         entries of each, in the order of the lanes, and the other entries; `None` if these
-        are most of them.
+        are many.
         """
         is_constant = places >= CONSTANTS
         safe = np.where(is_constant, 0, places)
@@ -326,7 +350,7 @@ class Cellar:
             )
             (whole if is_whole else rest).append(part)
         others = np.sort(np.concatenate(rest)) if rest else np.zeros(0, int)
-        if 2 * others.size > places.size:
+        if 16 * others.size > places.size:
             return None
         return whole, others
 
