@@ -11,6 +11,11 @@ from jax.sharding import Mesh, PartitionSpec
 from ..._programs import compiled
 
 
+# Lanes of a batch wait for the slowest, and more would not fit into the cache, where XLA
+# compiles the program. Machine code of ours takes four at a time in any case.
+_BATCH_ON_CPU = 64
+
+
 def make_lane(fn: Callable, parameters: dict[str, Any]) -> tuple[Any, Any]:
     """`fn` as a jitted function of a dictionary of parameters, and its trace."""
     try:
@@ -41,16 +46,18 @@ def make_lane(fn: Callable, parameters: dict[str, Any]) -> tuple[Any, Any]:
 
 
 class Chunk:
-    """Runs chunks of lanes, all with one program; `traced` is the trace of `lane`.
+    """Runs chunks of lanes, all with one program.
 
     Each device runs an equal share of a chunk, in batches of `batch_size` lanes. (Under a
     plain `jit` all devices would synchronise in each iteration of Newton's method.)
     """
 
-    def __init__(self, lane: Callable, traced: Any, lanes: int, batch_size: int | None):
+    def __init__(self, lane: Callable, lanes: int, batch_size: int | None):
         devices = jax.local_devices()
         share = -(-lanes // len(devices))
-        batch_size = share if batch_size is None else min(batch_size, share)
+        if batch_size is None:
+            batch_size = _BATCH_ON_CPU if devices[0].platform == "cpu" else share
+        batch_size = min(batch_size, share)
         self.lanes = lanes
         self.padded = len(devices) * batch_size * -(-share // batch_size)
         of_device = lambda parameters: jax.lax.map(lane, parameters, batch_size=batch_size)

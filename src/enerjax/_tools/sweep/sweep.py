@@ -55,9 +55,9 @@ def sweep(
       axis.
     - `chunk`: the largest number of lanes that are computed, reported and written at a
       time; all chunks have the same length.
-    - `batch_size`: how many lanes are vectorised. They all wait for the slowest of them.
-      By default 16 on CPUs, several hundred where small systems run side by side there
-      (small batches of them run one after the other), and all lanes of a chunk elsewhere.
+    - `batch_size`: how many lanes are vectorised. They all wait for the slowest of them,
+      except on CPUs, where four lanes are computed at a time if they can be machine code.
+      By default 64 on CPUs, and all lanes of a chunk elsewhere.
     - `sort_by`: the name of the parameter that the work of a lane depends on most, such as
       `h` if all runs end at the same time. Lanes of a batch then take similar times.
     - `path`: a folder to which each finished chunk is written. If the same sweep is called
@@ -86,7 +86,7 @@ def sweep(
     own = range(jax.process_index(), count, jax.process_count())
     lanes = [min(chunks.shape[1], order.size - k * chunks.shape[1]) for k in own]
     report = _reporter(progress, sum(lanes))
-    run, done = Chunk(lane, traced, chunks.shape[1], batch_size), {}
+    run, done = Chunk(lane, chunks.shape[1], batch_size), {}
     for number in own:
         leaves = store.read(number) if store else None
         if leaves is None:
