@@ -258,7 +258,36 @@ def solutions(x):
     ]
 
 
+def shifted(x):
+    """Long rows that are read from one place further on, with another number at an end."""
+    x = jnp.tile(jnp.sin(x), (1, 10))
+    turn = lambda c, _: (0.9 * jnp.roll(c, 1, axis=1) + x, jnp.sum(c))
+    return [
+        jnp.roll(x, 1, axis=1) * x,
+        jnp.pad(x, ((0, 0), (1, 0)))[:, :-1] + x,
+        jnp.pad(x, ((0, 0), (0, 1)), constant_values=3.0)[:, 1:] + x,
+        jnp.concatenate([x[:, 4:5], x[:, 1:-1], x[:, :1]], axis=1) * 2,
+        jax.lax.scan(turn, x, None, length=5),
+    ]
+
+
+def carries(x):
+    """Numbers of a carry that change places, or are a history, in loops within loops."""
+    history = lambda c, row: ((row, *c[:-1]), c[0] + 2 * c[2])
+    swapped = lambda c, _: ((c[1], c[0] * 0.9, c[2][::-1]), c[2][0])
+    inner = lambda c, row: jax.lax.scan(history, (c[0], row, c[2]), jnp.stack([c[1], row]))
+    first = x[0], x[1], x[2]
+    return [
+        jax.lax.scan(history, first, x),
+        jax.lax.scan(swapped, first, None, length=9),
+        jax.lax.scan(inner, first, x[::-1]),
+        jax.lax.scan(history, tuple(jnp.tile(y, 6) for y in first), jnp.tile(x, 6)),
+    ]
+
+
 PROGRAMS = {
+    "shifted": shifted,
+    "carries": carries,
     "put": lambda x: x.at[ROWS, COLUMNS].set(jnp.cos(x[:2, :2])),
     "put twice": lambda x: x.at[:, TWICE].set(1 + 0 * x),
     "add twice": lambda x: x.at[:, TWICE].add(jnp.cos(x)),

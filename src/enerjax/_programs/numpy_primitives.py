@@ -157,12 +157,28 @@ FUNCTIONS: dict[str, Callable] = {
 }
 
 
+_REDUCTIONS: dict[str, Callable] = {
+    "reduce_and": np.all,
+    "reduce_max": np.max,
+    "reduce_min": np.min,
+    "reduce_or": np.any,
+    "reduce_prod": np.prod,
+    "reduce_sum": np.sum,
+}
+
+
 def moved(primitive: Any, values: list[Any], params: dict[str, Any]) -> list[Any]:
     """The outputs of a primitive that moves entries, of arrays that are known."""
     values, move = list(map(np.asarray, values)), _EVERY_MOVE.get(primitive.name)
     if move is None or (move is _gather and not is_inside(*values, **params)):
         return evaluate(primitive, values, params)
     return move(*values, **params)
+
+
+def _is_plain(name: str, x: np.ndarray) -> bool:
+    """Whether NumPy reduces an array as JAX does: not bits, and no empty extremes."""
+    is_logical = name in ("reduce_and", "reduce_or")
+    return x.size > 0 and is_logical == (x.dtype.kind == "b")
 
 
 def evaluated(primitive: Any, values: list[Any], params: dict[str, Any]) -> list[Any]:
@@ -178,6 +194,9 @@ def evaluated(primitive: Any, values: list[Any], params: dict[str, Any]) -> list
         return [np.asarray(values[0]).astype(params["new_dtype"])]
     if name in FUNCTIONS:
         return [np.asarray(FUNCTIONS[name](*map(np.asarray, values)))]
+    if name in _REDUCTIONS and _is_plain(name, values[0]):
+        out = _REDUCTIONS[name](values[0], axis=tuple(params["axes"]))
+        return [np.asarray(out, values[0].dtype)]
     if name in JIT:
         program, consts = params["jaxpr"].jaxpr, params["jaxpr"].consts
         return interpret(

@@ -613,13 +613,25 @@ def _linear_solve(self: Evaluation, eqn: Any, values: list[Value]) -> list[Value
 
 def _factors(self: Evaluation, eqn: Any, values: list[Value]) -> list[Value]:
     name = eqn.primitive.name
-    if is_small(eqn):
-        fn = lambda *xs: in_plain_operations(name, list(xs), eqn.params)
-    elif name in BY_LOOPS and eqn.outvars[0].aval.size:
-        fn = lambda *xs: factors_by_loops(name, list(xs), eqn.params)
-    else:
+    small = is_small(eqn)
+    if not small and not (name in BY_LOOPS and eqn.outvars[0].aval.size):
         raise Unsupported(f"`{name}` of a large array")
-    return self.function(fn, *values)
+    like = tuple(jax.ShapeDtypeStruct(x.shape, _numpy_type(x)) for x in values)
+    return self.closed(_program_of_factors(name, small, like, _Params(eqn.params)), values)
+
+
+class _Params(dict):
+    """The parameters of an equation, as a key."""
+
+    def __hash__(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return hash(tuple(sorted(map(str, self.items()))))
+
+
+@functools.lru_cache(maxsize=256)
+def _program_of_factors(name: str, small: bool, like: Any, params: dict[str, Any]) -> Any:
+    """The plain operations that compute factors; they are traced once for each shape."""
+    factors = in_plain_operations if small else factors_by_loops
+    return jax.make_jaxpr(lambda *xs: factors(name, list(xs), params))(*like)
 
 
 _RULES: dict[str, Callable[[Evaluation, Any, list[Value]], list[Value]]] = {
