@@ -261,7 +261,7 @@ def solutions(x):
 def shifted(x):
     """Long rows that are read from one place further on, with another number at an end."""
     x = jnp.tile(jnp.sin(x), (1, 10))
-    turn = lambda c, _: (0.9 * jnp.roll(c, 1, axis=1) + x, jnp.sum(c))
+    turn = lambda c, _: (0.9 * jnp.roll(c, 1, axis=1) + x, jnp.mean(c))
     return [
         jnp.roll(x, 1, axis=1) * x,
         jnp.pad(x, ((0, 0), (1, 0)))[:, :-1] + x,
