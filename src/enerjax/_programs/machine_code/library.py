@@ -328,9 +328,14 @@ class _Library:
         target = llvm.Target.from_default_triple().create_target_machine(
             cpu=llvm.get_host_cpu_name(),
             features=llvm.get_host_cpu_features().flatten(),
-            opt=int(__import__("os").environ.get("LOPT", "2")),
+            opt=2,
+            reloc="pic",
+            jit=True,
         )
-        engine = llvm.create_mcjit_compiler(module, target)
+        code = target.emit_object(module)
+        # Only the code stays in memory, and not the text that it was made of.
+        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), target)
+        engine.add_object_file(llvm.ObjectFileRef.from_data(code))
         engine.finalize_object()
         address = engine.get_function_address("handler")
         capsule = jax.ffi.pycapsule(ctypes.cast(address, ctypes.c_void_p))
