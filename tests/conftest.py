@@ -24,6 +24,14 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
+@pytest.fixture(autouse=True, scope="session")
+def compile_quickly():
+    """Also by LLVM, for the same reason."""
+    from enerjax._programs.machine_code import library
+
+    library.OPTIMISATION = 0
+
+
 @pytest.fixture
 def is_type_checked(request):
     """Whether the annotations of the package are enforced in this run."""
@@ -37,7 +45,7 @@ gc.set_threshold(50_000, 20, 100)
 # A process can map only so many pieces of memory, 65530 on most machines, and each compiled
 # program takes some.
 MAPS = pathlib.Path("/proc/self/maps")
-MANY_MAPS = 10_000
+MANY_MAPS = 25_000
 
 
 @pytest.fixture(autouse=True, scope="module")
