@@ -9,7 +9,7 @@ import pytest
 from jax.ad_checkpoint import checkpoint_name
 
 from enerjax._programs import at_places, in_one_function, why_not_one_function
-from enerjax._programs.machine_code import loops
+from enerjax._programs.machine_code import emission, loops
 from enerjax._solvers.linear.dense import Inverse
 
 
@@ -148,6 +148,11 @@ NOT_POSSIBLE = {
     "sort": lambda x: jnp.sort(jnp.tile(x[0], 20)),
     "eigenvalues": lambda x: jnp.linalg.eigvalsh(x @ x.T + jnp.eye(2)),
     "in a loop": lambda x: jax.lax.fori_loop(0, 3, lambda _, y: jnp.linalg.qr(y.T)[0].T, x),
+    "function of what is there": lambda x: x.at[1].apply(jnp.exp),
+    "precision": lambda x: jax.lax.reduce_precision(x, 5, 3),
+    "a batch of loops": lambda x: jax.vmap(
+        lambda x: jax.lax.while_loop(lambda y: jnp.sum(y) < 5, lambda y: y + 1, x)
+    )(x),
     "prints": lambda x: (x, jax.debug.print("x"))[0] + 1,
     "random": lambda x: x + jax.random.uniform(jax.random.key((9 * x[0, 0]).astype(int))),
 }
@@ -437,6 +442,73 @@ def test_single_precision_and_whole_numbers():
     ):
         assert a.dtype == b.dtype
         np.testing.assert_allclose(a, b, rtol=2e-6)  # round-off of single precision
+
+
+def whole_numbers(k):
+    """At the ends of their range, where they are known only in part."""
+    last, least = np.int32(2**31 - 1), np.int32(-(2**31))
+    ends = jnp.concatenate([k, jnp.array([last, least, 0, -9], jnp.int32)])
+    divisor = jnp.where(ends == 0, 3, jnp.where(ends == least, -1, ends // 2 + 4))
+    bits = ends.astype(jnp.uint32)
+    return [
+        *(ends + 1, (ends + 1) > 0, (ends + 1) // 2, jnp.abs(ends), -ends, ends * ends),
+        *(jax.lax.div(ends, divisor), jax.lax.rem(ends, divisor), ends // divisor),
+        *((~bits).astype(float), (bits + 7).astype(float), ends % divisor),
+        jax.lax.div(jnp.full(3, 2**62 + 1), 3) + k,
+        jax.lax.shift_right_arithmetic(ends, jnp.full(7, -2, jnp.int32)),
+        jax.lax.dot_general(
+            jnp.tile(k.astype(jnp.int8) + 40, (50, 20)),
+            jnp.tile(k.astype(jnp.int8) + 40, (60, 20)),
+            (((1,), (1,)), ((), ())),
+            preferred_element_type=jnp.int32,
+        ),
+    ]
+
+
+def conversions(k):
+    x = jnp.concatenate([k.astype(float), jnp.array([1e30, -1e30, jnp.nan, -3.7])])
+    return [x.astype(t) for t in (jnp.int32, jnp.int64, jnp.uint32, bool, jnp.float32)]
+
+
+@pytest.mark.parametrize("fn", [whole_numbers, conversions], ids=lambda fn: fn.__name__)
+def test_numbers_at_the_ends_of_their_range(fn):
+    k = jnp.array([7, -5, 3], jnp.int32)
+    assert is_compiled(in_one_function(fn), k)
+    found, expected = jax.jit(in_one_function(fn))(k), jax.jit(fn)(k)
+    for a, b in zip(found, expected, strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
+
+
+def loops_over_the_same(x):
+    """Rows that are one row, or constant in part; a branch that no pass decides."""
+    turn = lambda c, row: (jnp.sin(c) + row, c * row)
+    branch = lambda k, c: jax.lax.cond(jnp.sum(x) > 0, lambda c: 1.01 * c, jnp.cos, c)
+    return [
+        jax.lax.scan(turn, x[0, 0], jnp.broadcast_to(x[0, 1], (60,))),
+        jax.lax.scan(turn, x[0, 0], jnp.stack([x[0, 1], 5.0])),
+        jax.lax.fori_loop(0, 50, branch, x),
+    ]
+
+
+def large_carry(x):
+    """More numbers than a kernel holds, each of which moves on."""
+    numbers = tuple(jnp.arange(4.0) + 4 * k + x[0, 0] for k in range(160))
+    turn = lambda c: (c[0] + 1, (c[1][-1], *c[1][:-1]))
+    return jax.lax.while_loop(lambda c: c[0] < 5, turn, (0, numbers))[1]
+
+
+@pytest.mark.parametrize(
+    "fn", [loops_over_the_same, large_carry], ids=lambda fn: fn.__name__
+)
+def test_loops_that_are_written_as_loops(fn, monkeypatch):
+    monkeypatch.setattr(loops, "_WRITTEN_OUT", 0)
+    # So that kernels are divided.
+    monkeypatch.setattr(emission, "_LONGEST", 300)
+    assert is_compiled(in_one_function(fn), X)
+    found, expected = jax.jit(in_one_function(fn))(X), jax.jit(fn)(X)
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-13)
+    jax.tree.map(close, found, expected)
 
 
 # Lanes ----------------------------------------------------------------------------------

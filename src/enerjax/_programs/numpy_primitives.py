@@ -157,6 +157,18 @@ FUNCTIONS: dict[str, Callable] = {
 }
 
 
+def _converted(x: np.ndarray, dtype: Any) -> np.ndarray:
+    """Numbers of another type; whole numbers that do not fit are the nearest that do."""
+    dtype = np.dtype(dtype)
+    if x.dtype.kind != "f" or dtype.kind not in "iu":
+        return x.astype(dtype)
+    info = np.iinfo(dtype)
+    whole = np.nan_to_num(np.clip(x, info.min, info.max), nan=0.0)
+    inside = (whole > info.min) & (whole < info.max)
+    ends = np.where(whole > 0, info.max, info.min).astype(dtype)
+    return np.where(inside, np.where(inside, whole, 0).astype(dtype), ends)
+
+
 _REDUCTIONS: dict[str, Callable] = {
     "reduce_and": np.all,
     "reduce_max": np.max,
@@ -191,7 +203,7 @@ def evaluated(primitive: Any, values: list[Any], params: dict[str, Any]) -> list
     if name == "select_n":
         return _select(*map(np.asarray, values))
     if name == "convert_element_type":
-        return [np.asarray(values[0]).astype(params["new_dtype"])]
+        return [_converted(np.asarray(values[0]), params["new_dtype"])]
     if name in FUNCTIONS:
         return [np.asarray(FUNCTIONS[name](*map(np.asarray, values)))]
     if name in _REDUCTIONS and _is_plain(name, values[0]):

@@ -199,8 +199,8 @@ def _filling(params: Any, dtype: str) -> Number:
 def scatter(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
     operand, index, updates = values
     dtype, adds = dtype_of(operand), eqn.primitive.name == "scatter-add"
-    if eqn.params.get("update_jaxpr") is not None and not adds:
-        pass
+    if not adds and not _replaces(eqn.params.get("update_jaxpr")):
+        raise Unsupported("a function of what is at a place")
     size, count = math.prod(operand.shape), math.prod(updates.shape)
     if count == 0:
         return [operand]
@@ -214,6 +214,11 @@ def scatter(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
         numbers = source.reshape(operand.shape)
         return [self.taken([operand, updates], firsts, numbers, dtype)]
     return [_added(self, operand, updates, places, dtype)]
+
+
+def _replaces(update: Any) -> bool:
+    """Whether a scatter writes its updates, and not a function of what was there."""
+    return update is None or (not update.eqns and update.outvars == update.invars[1:])
 
 
 def _places_of_updates(

@@ -78,19 +78,23 @@ def _large_product(self: "Evaluation", eqn: Any, values: list[Value]) -> Value:
     """A product of large arrays, row by row in a loop."""
     numbers = eqn.params["dimension_numbers"]
     (contracted, of_right), (batch, right_batch) = numbers
-    left, _ = values
+    (left, _), dtype = values, eqn.outvars[0].aval.dtype
     free = [k for k in range(len(left.shape)) if k not in (*contracted, *batch)]
     if len(batch) > 1 or not (batch or free):
         raise Unsupported("a product of large arrays")
 
     def by_batch(a: Array, b: Array) -> Array:
-        product = lambda x: jax.lax.dot_general(x[0], x[1], _without_batch(numbers))
+        product = lambda x: jax.lax.dot_general(
+            x[0], x[1], _without_batch(numbers), preferred_element_type=dtype
+        )
         first = jnp.moveaxis(a, batch[0], 0), jnp.moveaxis(b, right_batch[0], 0)
         return jax.lax.map(product, first)
 
     def by_row(a: Array, b: Array) -> Array:
         axes = tuple(k - (k > free[0]) for k in contracted)
-        product = lambda row: jax.lax.dot_general(row, b, ((axes, of_right), ((), ())))
+        product = lambda row: jax.lax.dot_general(
+            row, b, ((axes, of_right), ((), ())), preferred_element_type=dtype
+        )
         return jax.lax.map(product, jnp.moveaxis(a, free[0], 0))
 
     return self.function(by_batch if batch else by_row, *values)[0]

@@ -293,10 +293,13 @@ def _kernels(regions: list[Region]) -> dict[tuple, list[Node]]:
     needed = [x for x in live if x.op not in NOT_COMPUTED and x.region in order]
     needed.sort(key=lambda x: (order[x.region], x.level, x.lanes, x.number))
     kernels: dict[tuple, list[Node]] = {}
+    parts: dict[tuple, int] = {}
     for node in needed:
         key = node.region, node.level, node.lanes
-        part = 0
-        while len(kernels.get((*key, part), ())) >= _LONGEST and not node.lanes:
-            part += 1
+        part = parts.get(key, 0)
+        # Numbers of a carry are all read before the first is written.
+        is_full = len(kernels.get((*key, part), ())) >= _LONGEST
+        if is_full and not node.lanes and node.op != "store":
+            part = parts[key] = part + 1
         kernels.setdefault((*key, part), []).append(node)
     return kernels

@@ -23,7 +23,7 @@ from .computed_places import dynamic_slice, dynamic_update_slice, gather, scatte
 from .contraction import contraction
 from .dense import BY_LOOPS, factors_by_loops
 from .elementwise import ELEMENTWISE
-from .graph import Graph, Node, Number
+from .graph import as_number, Graph, Node, Number
 from .small_matrices import in_plain_operations, is_small
 from .values import (
     Cellar,
@@ -45,7 +45,7 @@ NAME = "enerjax_one_function"
 
 _SAME = frozenset(
     """
-    copy copy_p name optimization_barrier reduce_precision stop_gradient xla_metadata_value
+    copy copy_p name optimization_barrier stop_gradient xla_metadata_value
     """.split()
 )
 
@@ -386,6 +386,8 @@ class Evaluation:
     def _over_lanes(self, op: str, dtype: str, x: Number, n: int) -> Number:
         if isinstance(x, Node) and x.lanes and not x.is_reduced:
             return self.graph.reduce(op, dtype, x)
+        if op == "xor":
+            return x if n % 2 else as_number(0, dtype)
         if op == "add":
             factor = n if dtype[0] != "f" else float(n)
             return self.graph.op("mul", dtype, (x, factor))
@@ -537,7 +539,8 @@ def _reduction(self: Evaluation, eqn: Any, values: list[Value]) -> list[Value]:
         return values
     out = eqn.outvars[0].aval
     if math.prod(values[0].shape) == 0:
-        neutral = {"reduce_sum": 0, "reduce_prod": 1, "reduce_and": 1, "reduce_or": 0}
+        every = True if out.dtype == bool else -1
+        neutral = {"reduce_sum": 0, "reduce_prod": 1, "reduce_and": every, "reduce_or": 0}
         if eqn.primitive.name not in neutral:
             raise Unsupported("an extreme of no numbers")
         return [np.full(out.shape, neutral[eqn.primitive.name], out.dtype)]

@@ -209,12 +209,18 @@ def number_type(dtype: str) -> type:
 
 
 def _rem(a: Any, b: Any) -> Any:
+    if isinstance(a, int):
+        # The quotient is rounded towards zero.
+        return a - b * _div(a, b) if b else a
     return np.fmod(a, b)
 
 
 def _div(a: Any, b: Any) -> Any:
-    if isinstance(a, int) and isinstance(b, int):
-        return int(a / b) if b else -1
+    if isinstance(a, int):
+        if b == 0:
+            return -1
+        quotient = abs(a) // abs(b)
+        return quotient if (a < 0) == (b < 0) else -quotient
     return np.divide(a, b)
 
 
@@ -229,7 +235,7 @@ def _shift_right(a: Any, b: Any, size: int) -> Any:
 
 
 def _shift_right_signed(a: Any, b: Any, size: int) -> Any:
-    return np.right_shift(a, np.clip(b, 0, size - 1))
+    return np.right_shift(a, b if 0 <= b < size else size - 1)
 
 
 _SHIFTS: dict[str, Callable[..., Any]] = {
@@ -299,10 +305,10 @@ def _folded(op: str, dtype: str, operands: tuple[Any, ...], extra: Any) -> Numbe
             return bool(_COMPARE[extra[0]](*operands))
         if op == "convert":
             (x,) = operands
-            return as_number(np.asarray(x, extra).astype(dtype)[()], dtype)
+            return _converted(x, dtype)
         if op == "not":
             (x,) = operands
-            return (not x) if dtype == "b1" else ~x
+            return (not x) if dtype == "b1" else as_number(~x, dtype)
         if op == "call":
             values = (np.asarray(x, dtype) for x in operands)
             return as_number(_CALLS[extra](*values), dtype)
@@ -315,11 +321,30 @@ def _folded(op: str, dtype: str, operands: tuple[Any, ...], extra: Any) -> Numbe
         return as_number(_FOLD[op](*operands), dtype)
 
 
+def _converted(x: Any, dtype: str) -> Number:
+    """A number of another type; what does not fit is moved to the end of the range."""
+    if dtype[0] in "iu" and isinstance(x, float):
+        info = np.iinfo(dtype)
+        if x != x:
+            return 0
+        return (
+            int(min(max(x, float(info.min)), float(info.max)))
+            if abs(x) < 1e18
+            else (int(info.max) if x > 0 else int(info.min))
+        )
+    return as_number(x, dtype)
+
+
 def as_number(x: Any, dtype: str) -> Number:
     """A number of Python, rounded to its type."""
     if dtype == "f4":
         return float(np.float32(x))
-    return number_type(dtype)(x)
+    kind = dtype[0]
+    if kind not in "iu":
+        return number_type(dtype)(x)
+    size = 1 << (8 * int(dtype[1]))
+    number = int(x) % size
+    return number - size if kind == "i" and number >= size // 2 else number
 
 
 # Simpler forms ----------------------------------------------------------------------------
@@ -346,8 +371,6 @@ def _simpler_sub(graph, dtype, operands, extra):
     a, b = operands
     if _is(b, 0):
         return a
-    if _is(a, 0):
-        return graph.op("neg", dtype, (b,))
     if isinstance(b, Node) and b.op == "neg":
         return graph.op("add", dtype, (a, b.operands[0]))
     return None
@@ -375,7 +398,7 @@ def _simpler_div(graph, dtype, operands, extra):
     if not isinstance(b, Node) and dtype[0] == "f" and b:
         mantissa, _ = math.frexp(b)
         # The inverse of a power of two is exact.
-        if abs(mantissa) == 0.5 and 1e-300 < abs(b) < 1e300:
+        if abs(mantissa) == 0.5 and 1e-30 < abs(b) < 1e30:
             return graph.op("mul", dtype, (a, 1.0 / b))
     return None
 

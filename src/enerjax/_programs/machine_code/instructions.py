@@ -101,14 +101,20 @@ class Instructions:
         return self._whole_division("rem", dtype, a, b)
 
     def _whole_division(self, op, dtype, a, b):
-        """Division by zero would end the process."""
-        t, sign = self._t(dtype), "s" if dtype[0] == "i" else "u"
-        mask = self._t("b1")
+        """Division by zero, or of the least number by -1, would end the process."""
+        t, mask, is_signed = self._t(dtype), self._t("b1"), dtype[0] == "i"
         zero, one = self._known(0, dtype), self._known(1, dtype)
+        minus = self._known(-1 if is_signed else 2 ** (8 * int(dtype[1])) - 1, dtype)
         is_zero = self._say(f"icmp eq {t} {b}, {zero}")
-        b = self._say(f"select {mask} {is_zero}, {t} {one}, {t} {b}")
-        out = self._say(f"{sign}{op} {t} {a}, {b}")
-        other = self._known(-1, dtype) if op == "div" else a
+        safe = self._say(f"select {mask} {is_zero}, {t} {one}, {t} {b}")
+        if is_signed:
+            is_minus = self._say(f"icmp eq {t} {b}, {minus}")
+            safe = self._say(f"select {mask} {is_minus}, {t} {one}, {t} {safe}")
+        out = self._say(f"{'s' if is_signed else 'u'}{op} {t} {a}, {safe}")
+        if is_signed:
+            negative = self._say(f"sub {t} {zero}, {a}") if op == "div" else zero
+            out = self._say(f"select {mask} {is_minus}, {t} {negative}, {t} {out}")
+        other = minus if op == "div" else a
         return self._say(f"select {mask} {is_zero}, {t} {other}, {t} {out}")
 
     def _neg(self, dtype, node, x):

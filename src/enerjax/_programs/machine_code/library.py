@@ -21,12 +21,13 @@ from .values import (
     Memory,
     NotWideError,
     type_name,
+    Unsupported,
     Value,
 )
 
 
-# The level at which LLVM optimises the code, from 0 to 3. The first one compiles three times
-# as fast, and its code takes twice as long.
+# The level at which LLVM optimises the code, from 0 to 3. The first one compiles three
+# times as fast, and its code takes twice as long.
 OPTIMISATION = 2
 
 _CODES = {"f8": "double", "f4": "float", "b1": "i8"} | {
@@ -89,7 +90,11 @@ def graph_of(
             else np.zeros(aval.shape, aval.dtype)
         )
     count = len(jaxpr.constvars)
-    outs = evaluation.outputs(jaxpr, values[:count], values[count:])
+    try:
+        outs = evaluation.outputs(jaxpr, values[:count], values[count:])
+    except (AssertionError, LookupError, TypeError, ValueError) as error:
+        # XLA may know what was not foreseen here.
+        raise Unsupported(f"an error here, {error!r},") from error
     outs = [
         np.asarray(x, var.aval.dtype) if isinstance(x, np.ndarray) else x
         for x, var in zip(outs, jaxpr.outvars, strict=True)

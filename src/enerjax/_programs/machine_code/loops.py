@@ -15,6 +15,7 @@ from .graph import Node, Number, Region
 from .values import (
     Block,
     Cells,
+    CONSTANTS,
     dtype_of,
     Memory,
     MOST_CELLS,
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 
 # The number of passes that are made at a time, if they do not depend on one another.
 WIDTH = 4
+# With more numbers in a carry than this, its kernels may be divided.
+_MANY = 500
 # Loops with no more operations than this in all passes are written out.
 _WRITTEN_OUT = 150
 
@@ -72,10 +75,13 @@ class While:
 
 
 class Branch:
-    """One of several regions, whose number is in the cell `which`."""
+    """One of several regions, whose number is in the cell `which`.
 
-    def __init__(self, branches: list[Region], which: int):
-        self.branches, self.which = branches, which
+    `marker` stands for the level from which the number can be read.
+    """
+
+    def __init__(self, branches: list[Region], which: int, marker: Node):
+        self.branches, self.which, self.marker = branches, which, marker
         self.level = 0
 
     @property
@@ -94,8 +100,10 @@ def _finish(self: "Evaluation", item: Any, extra: Sequence[Node] = ()) -> None:
 
 
 def _read_from(region: Region, item: Any) -> list[Node]:
-    """The nodes of a region that the regions of an item read."""
+    """The nodes of a region that an item reads."""
     found = []
+    if isinstance(item, Branch) and item.marker.region is region:
+        found.append(item.marker)
     for inner in item.regions:
         for node in inner.nodes:
             if node.region is region:
@@ -308,8 +316,13 @@ class _Carry:
         for x, at in zip(numbers, cells, strict=True):
             if isinstance(x, Node) and x.op == "load" and _is_in_place(evaluation, x, at):
                 continue
-            is_read = isinstance(x, Node) and (x.op in ("load", "dynamic") or not x.lanes)
-            if is_read and not isinstance(at, int):
+            is_read = isinstance(x, Node) and x.op in ("load", "dynamic")
+            if isinstance(at, int):
+                # Single numbers are all read before the first is written, but if they are
+                # so many that their kernel is divided.
+                if is_read and len(numbers) > _MANY:
+                    x = graph.node("copy", dtype, (x,), at)
+            elif is_read or (isinstance(x, Node) and not x.lanes):
                 x = graph.node("copy", dtype, (x,), lanes=len(at))
             pairs.append((x, at))
 
@@ -461,7 +474,9 @@ def _rows_in_order(self: "Evaluation", x: Value) -> Value:
     places = self.cellar.of_one_memory(memory.places, memory.dtype)
     flat = places.reshape(len(places), -1)
     steps = np.diff(flat, axis=0)
-    if steps.size == 0 or np.all(steps == steps[0, 0]):
+    # Constants are far from other cells, but not by the distance of their numbers.
+    is_mixed = np.any(places >= CONSTANTS) and np.any(places < CONSTANTS)
+    if steps.size == 0 or (np.all(steps == steps[0, 0]) and not is_mixed):
         return Memory(memory.dtype, places)
     return self.cellar.contiguous(memory)
 
@@ -477,6 +492,8 @@ def _row(self: "Evaluation", x: Value, counter: Node) -> Value:
         return np.zeros(x.shape[1:], x.dtype)
     flat = x.places.reshape(len(x.places), -1)
     stride = int(flat[1, 0] - flat[0, 0])
+    if stride == 0:
+        return Memory(x.dtype, x.places[0])
     offset = self.graph.multiply("i8", counter, stride)
     assert isinstance(offset, Node)
     shape, first = x.shape[1:], x.places[0]
@@ -520,6 +537,8 @@ def _written_out(self, closed, consts, carry, rows, length, reverse) -> list[Val
 
 def _while(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
     params, graph = eqn.params, self.graph
+    if params["cond_jaxpr"].out_avals[0].shape:
+        raise Unsupported("a loop that a batch inside of a program ends together")
     first, second = params["cond_nconsts"], params["body_nconsts"]
     outer, inner = values[:first], values[first : first + second]
     closed = params["body_jaxpr"]
@@ -573,8 +592,8 @@ def _cond(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
         )
         for _ in branches
     ]
-    item = Branch(regions, self.cellar.place_of(which, "i8"))
     marker = self.cellar.marker(which.region, _level_of(which, which.region))
+    item = Branch(regions, self.cellar.place_of(which, "i8"), marker)
     outs = []
     for region, branch in zip(regions, branches, strict=True):
         with _within(self, region):
@@ -594,7 +613,7 @@ def _cond(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
             with _within(self, region):
                 _stores(self, value, places, region, 0, mask=region.mask)
         results.append(Memory(dtype, places))
-    _finish(self, item, [marker])
+    _finish(self, item)
     for owner in owners:
         owner.region, owner.ready = graph.current, item.level + 1
     return results

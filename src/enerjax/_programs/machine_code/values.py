@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jax.extend import source_info_util
 
-from .graph import as_number, Graph, Node, Number, number_type, Region
+from .graph import as_number, Graph, Node, Number, Region
 
 
 # Arrays with fewer entries are not computed lane by lane, and neither are those whose
@@ -482,4 +482,4 @@ def _bits(x: np.ndarray) -> np.ndarray:
 def from_bits(cell: Any, dtype: str) -> Number:
     if dtype[0] == "f":
         return float(np.asarray(cell, np.int64).view(np.float64)[()])
-    return number_type(dtype)(cell)
+    return as_number(int(cell), dtype)
