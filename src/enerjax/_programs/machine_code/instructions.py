@@ -110,10 +110,11 @@ class Instructions:
         if is_signed:
             is_minus = self._say(f"icmp eq {t} {b}, {minus}")
             safe = self._say(f"select {mask} {is_minus}, {t} {one}, {t} {safe}")
-        out = self._say(f"{'s' if is_signed else 'u'}{op} {t} {a}, {safe}")
-        if is_signed:
+            out = self._say(f"s{op} {t} {a}, {safe}")
             negative = self._say(f"sub {t} {zero}, {a}") if op == "div" else zero
             out = self._say(f"select {mask} {is_minus}, {t} {negative}, {t} {out}")
+        else:
+            out = self._say(f"u{op} {t} {a}, {safe}")
         other = minus if op == "div" else a
         return self._say(f"select {mask} {is_zero}, {t} {other}, {t} {out}")
 
