@@ -206,8 +206,8 @@ FAULTS = (
     Fault(
         "machine code: a carry that changes places",
         "_programs/machine_code/loops.py",
-        "            if is_read and not isinstance(at, int):\n",
-        "            if False:\n",
+        "            elif is_read or (isinstance(x, Node) and not x.lanes):\n",
+        "            elif False:\n",
         "A number of a carry is read after another one was written to its place.",
         of("machine_code::test_values_and_derivatives"),
     ),

@@ -298,58 +298,32 @@ def _scattered_to_computed(self: "Evaluation", eqn: Any, values: list[Value]) ->
     """Updates at computed places: every place asks whether an update is its own."""
     operand, index, updates = values
     params, graph, dtype = eqn.params, self.graph, dtype_of(operand)
-    dims = params["dimension_numbers"]
-    adds = eqn.primitive.name == "scatter-add"
-    if dims.operand_batching_dims:
-        raise Unsupported("a scatter with batch axes at computed places")
-    rows = index.shape[:-1]
-    count = math.prod(rows)
-    size = math.prod(operand.shape)
+    dims, adds = params["dimension_numbers"], eqn.primitive.name == "scatter-add"
+    count, size = math.prod(index.shape[:-1]), math.prod(operand.shape)
     kept = [k for k in range(len(operand.shape)) if k not in dims.inserted_window_dims]
     window = [updates.shape[k] for k in dims.update_window_dims]
-    mapped = dims.scatter_dims_to_operand_dims
-    if count * size > 8 * MOST_CELLS or any(
-        window[kept.index(axis)] != 1 for axis in mapped if axis in kept
-    ):
-        raise Unsupported("a scatter to computed places")
+    # An update covers an axis, or has one place along it.
+    covered = dict(zip(kept, window, strict=True)) if not dims.operand_batching_dims else {}
+    axes = dims.scatter_dims_to_operand_dims
+    whole = [covered.get(axis, 1) for axis in range(len(operand.shape))]
+    is_row = all(n in (1, m) for n, m in zip(whole, operand.shape, strict=True))
+    if not is_row or any(whole[axis] != 1 for axis in axes) or dims.operand_batching_dims:
+        raise Unsupported("a scatter of windows to computed places")
+    if count * size > 8 * MOST_CELLS:
+        raise Unsupported("many updates of computed places")
     batch = [k for k in range(len(updates.shape)) if k not in dims.update_window_dims]
-    turned = self.move(
-        jax.lax.transpose_p,
-        [updates],
-        dict(permutation=(*batch, *dims.update_window_dims)),
-    )[0]
-    turned = self.reshaped(turned, (count, *window))
-    starts = self.cellar.unlaned(index).reshape(count, -1)
-    of, out = dtype_of(index), operand
+    order = dict(permutation=(*batch, *dims.update_window_dims))
+    turned = self.reshaped(
+        self.move(jax.lax.transpose_p, [updates], order)[0], (count, *window)
+    )
+    starts, of = self.cellar.unlaned(index).reshape(count, -1), dtype_of(index)
     clips = params["mode"] == jax.lax.GatherScatterMode.CLIP
+    coordinates, out = np.indices(operand.shape), operand
     for k in range(count):
-        part = self.subarray(turned, (slice(k, k + 1),))
-        full = [
-            1 if a in dims.inserted_window_dims else window[kept.index(a)]
-            for a in range(len(operand.shape))
-        ]
-        if any(n not in (1, m) for n, m in zip(full, operand.shape, strict=True)):
-            raise Unsupported("a scatter of windows to computed places")
-        part = self.reshaped(part, tuple(full))
-        part = self.move(
-            jax.lax.broadcast_in_dim_p,
-            [part],
-            dict(
-                shape=operand.shape,
-                broadcast_dimensions=tuple(range(len(full))),
-                sharding=None,
-            ),
-        )[0]
-        masks, numbers = [], []
-        for axis, entry in zip(mapped, starts[k].tolist(), strict=True):
-            entry = _whole_number(self, entry, of)
-            if clips:
-                entry = _clamped(self, entry, operand.shape[axis] - 1)
-            numbers.append(entry)
-            place = np.arange(operand.shape[axis]).reshape(
-                [-1 if j == axis else 1 for j in range(len(full))]
-            )
-            masks.append(np.broadcast_to(place, operand.shape))
+        numbers = [_whole_number(self, x, of) for x in starts[k].tolist()]
+        if clips:
+            pairs = zip(numbers, axes, strict=True)
+            numbers = [_clamped(self, x, operand.shape[axis] - 1) for x, axis in pairs]
 
         def rule(old, new, *places, numbers=numbers):
             on: Number = True
@@ -358,5 +332,7 @@ def _scattered_to_computed(self: "Evaluation", eqn: Any, values: list[Value]) ->
             new = graph.add(dtype, old, new) if adds else new
             return graph.select(dtype, on, new, old)
 
-        out = self.map(rule, [out, part, *masks], operand.shape, dtype)
+        part = self.reshaped(self.subarray(turned, (slice(k, k + 1),)), tuple(whole))
+        parts = [out, self.spread(part, operand.shape), *coordinates[[*axes]]]
+        out = self.map(rule, parts, operand.shape, dtype)
     return out

@@ -157,7 +157,7 @@ class Evaluation:
         size = math.prod(shape)
         if size == 0:
             return np.zeros(shape, dtype)
-        values = [self._spread(x, shape) if x.shape else x for x in values]
+        values = [self.spread(x, shape) if x.shape else x for x in values]
         rows = self.rows_of.get(size) if len(shape) == 1 else None
         if rows is not None:
             values = [self.reshaped(x, rows) if x.shape else x for x in values]
@@ -217,7 +217,7 @@ class Evaluation:
             places[k] = self.cellar.place_of(rule(*xs), dtype)
         return Memory(dtype, places.reshape(shape))
 
-    def _spread(self, x: Value, shape: tuple[int, ...]) -> Value:
+    def spread(self, x: Value, shape: tuple[int, ...]) -> Value:
         """An operand whose axes of length 1 stand for longer ones."""
         if x.shape == shape:
             return x
