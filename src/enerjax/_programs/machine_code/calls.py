@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import jaxlib
 import numpy as np
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, Primitive
 from jax.interpreters import ad, batching, mlir
@@ -24,6 +25,8 @@ from .library import compiled_function, Function, graph_of
 from .values import Unsupported
 
 
+# The first version of jaxlib whose interface for functions of others was tried.
+_SINCE = (0, 10)
 # The most numbers that a function returns: their places are tables while it is compiled.
 _MOST_RESULTS = 4_000_000
 # The lanes of a batch are computed by several calls if their results are more numbers.
@@ -102,6 +105,8 @@ class Program:
     @functools.cached_property
     def function(self) -> Function | Unsupported:
         """The function of machine code, or the reason why there is none."""
+        if jaxlib.version.__version_info__ < _SINCE:
+            return Unsupported("this version of jaxlib")
         try:
             return compiled_function(self.jaxpr, self.known)
         except Unsupported as reason:
