@@ -36,8 +36,8 @@ _MOST_OF_LANES = 1_000_000
 def in_one_function(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Array]]:
     """`fn`, between trees of arrays, as one function of machine code where it can be.
 
-    The values are the same either way, but for round-off. The lanes of a batch are computed
-    several at a time, each with the iterations that it needs.
+    The values are the same either way, but for round-off. The lanes of a batch run one
+    after the other, each with the iterations that it needs.
     """
     return functools.partial(_called, fn, False)
 

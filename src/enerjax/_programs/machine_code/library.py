@@ -19,7 +19,6 @@ from .values import (
     CONSTANTS,
     dtype_of,
     Memory,
-    NotWideError,
     type_name,
     Unsupported,
     Value,
@@ -51,20 +50,11 @@ def compiled_function(jaxpr: Any, known: Sequence[np.ndarray | None]) -> Functio
 
     Raises `Unsupported`.
     """
-    try:
-        return _compiled(jaxpr, known, True)
-    except NotWideError:
-        return _compiled(jaxpr, known, False)
-
-
-def _compiled(
-    jaxpr: Any, known: Sequence[np.ndarray | None], may_be_wide: bool
-) -> Function:
-    return _function(*graph_of(jaxpr, known, may_be_wide))
+    return _function(*graph_of(jaxpr, known))
 
 
 def graph_of(
-    jaxpr: Any, known: Sequence[np.ndarray | None], may_be_wide: bool = True
+    jaxpr: Any, known: Sequence[np.ndarray | None], may_be_wide: bool = False
 ) -> tuple[Cellar, list, list]:
     """The graph of a program, with the cells of its inputs and outputs.
 
