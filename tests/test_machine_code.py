@@ -583,6 +583,19 @@ def long_rows(x, y):
     return count, rows.sum(axis=0), kept, several, jnp.roll(table[:, 1], 3) @ rows[:, 0]
 
 
+def rows_after_the_first(x, y):
+    """The cell before the rows belongs to a number that all lanes may share."""
+
+    def turn(x, _):
+        x = jnp.sin(x * y[0]) + jnp.cos(y)
+        shared = jnp.stack([x[0], jnp.cos(y[1]), jnp.sin(y[1])])
+        return x, (shared[jnp.where(x[1] > 0.3, 1, 2)], x)
+
+    shared, rows = jax.lax.scan(turn, x, None, length=40)[1]
+    rows = jnp.concatenate([x[None], rows])
+    return jnp.sum(rows**2, axis=1), jnp.sum(shared)
+
+
 OF_LANES = [
     arithmetic,
     computed_places,
@@ -591,6 +604,7 @@ OF_LANES = [
     running_sums,
     factors_of_lanes,
     long_rows,
+    rows_after_the_first,
 ]
 
 

@@ -53,10 +53,7 @@ _SAME = frozenset(
 class Evaluation:
     """Evaluates programs in the current region of a graph."""
 
-    def __init__(
-        self, rows_of: dict[int, tuple[int, int]] | None = None, may_be_wide: bool = True
-    ):
-        self.may_be_wide = may_be_wide
+    def __init__(self, rows_of: dict[int, tuple[int, int]] | None = None):
         self.graph = Graph()
         self.cellar = Cellar(self.graph)
         # The rows in which vectors of some lengths are read.

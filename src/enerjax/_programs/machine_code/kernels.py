@@ -12,7 +12,7 @@ from typing import Any, TYPE_CHECKING
 from .graph import Node, Number, Region
 from .instructions import Instructions, TYPES
 from .loops import Scan, WIDTH
-from .values import CONSTANTS, NotWideError, Unsupported
+from .values import CONSTANTS, Unsupported
 
 
 if TYPE_CHECKING:
@@ -213,21 +213,23 @@ class Kernel(Instructions):
                 self._lane_pointer(k, first, stride, table) for k in range(self.step)
             ]
             return self._load_each(pointers, dtype)
-        if not self._lanes_have_passes(first, table):
+        if not self._lanes_have_passes(first, stride, table):
             return self._load_single(self._lane_pointer(0, first, stride, table), dtype)
         index = self._lane_index(first, stride, table)
         return self._load_vector(self._wide_pointer(index), dtype)
 
-    def _lanes_have_passes(self, first: int | None, table: int | None) -> bool:
+    def _lanes_have_passes(self, first: int | None, stride: int, table: int | None) -> bool:
         if first is not None:
-            return self._has_passes(first)
+            # The cell of the first lane may belong to another number, whose value is not
+            # used; see `Cellar._shifted`.
+            return self._has_passes(first + stride)
         if not self.is_wide:
             return False
         assert table is not None
         places = self.emission.cellar.tables[table]
         own = [self.emission.cellar.is_wide(int(p)) for p in places[places < CONSTANTS]]
         if any(own) and not all(own):
-            raise NotWideError
+            raise Unsupported("an array of which passes share only some numbers")
         return any(own)
 
     def _lane_index(self, first: int | None, stride: int, table: int | None) -> str:
@@ -312,7 +314,7 @@ class Kernel(Instructions):
         index: Any = self._index(first) if first is not None else 0
         if self.lanes:
             index = self._lane_index(first, stride, table)
-        if not self._lanes_have_passes(first, table):
+        if not self._lanes_have_passes(first, stride, table):
             # A row of each pass, in the memory outside.
             numbers = self._value(counter[0], "i8")
             pointers = []

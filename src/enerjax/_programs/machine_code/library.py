@@ -54,13 +54,13 @@ def compiled_function(jaxpr: Any, known: Sequence[np.ndarray | None]) -> Functio
 
 
 def graph_of(
-    jaxpr: Any, known: Sequence[np.ndarray | None], may_be_wide: bool = False
+    jaxpr: Any, known: Sequence[np.ndarray | None]
 ) -> tuple[Cellar, list, list]:
     """The graph of a program, with the cells of its inputs and outputs.
 
     Raises `Unsupported`.
     """
-    evaluation = Evaluation(rows_of_vectors(jaxpr), may_be_wide)
+    evaluation = Evaluation(rows_of_vectors(jaxpr))
     cellar = evaluation.cellar
     variables = [*jaxpr.constvars, *jaxpr.invars]
     values: list[Value] = []

@@ -388,8 +388,7 @@ def _scan(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
         return _written_out(self, closed, consts, carry, rows, length, reverse)
     jaxpr, graph, cellar = closed.jaxpr, self.graph, self.cellar
     carry = _as_types(carry, closed.out_avals[:count])
-    is_wide = self.may_be_wide and graph.current is graph.root
-    is_wide = is_wide and count == 0 and length >= WIDTH
+    is_wide = graph.current is graph.root and count == 0 and length >= WIDTH
     body = Region(graph.current, is_wide=is_wide)
     counter_place = cellar.new(1, Block(body, 0))
     item = Scan(body, length, reverse, counter_place, is_wide)

@@ -44,10 +44,6 @@ class Unsupported(Exception):
         return f"{self.reason} in {lines[0]}" if lines else self.reason
 
 
-class NotWideError(Exception):
-    """Passes of a loop that cannot be made several at a time."""
-
-
 class Cells:
     def __init__(self, dtype: str, cells: np.ndarray, lane: int | None = None, n: int = 1):
         self.dtype, self.cells, self.lane, self.n = dtype, cells, lane, n
