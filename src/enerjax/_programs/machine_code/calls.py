@@ -266,7 +266,7 @@ def _lanes(numbers: Any, axes: Any, *, program: Program) -> tuple[list, list[int
 def _of_lanes(
     program: Program, own: list[Array], shared: list[Array], batched: list[bool]
 ) -> list[Array]:
-    """The outputs for all lanes: loops in which each has the iterations that it needs."""
+    """The outputs for all lanes, in a loop in which each has the iterations that it needs."""
     of_lane = lambda own: program(_merged(batched, own, shared))
     if any(map(_is_sharded, own)):
         # Each device computes its own lanes.
@@ -281,17 +281,17 @@ def _of_lanes(
     run = lambda own: run_closed(closed(own), own, wanted, program.is_part)
     wanted, lanes = [True] * len(program.jaxpr.outvars), len(own[0])
     size = sum(math.prod(x.aval.shape) for x in program.jaxpr.outvars)
-    most = max(_MOST_OF_LANES // max(size, 1), 1)
-    if lanes <= most:
+    chunks = -(-lanes * max(size, 1) // _MOST_OF_LANES)
+    if chunks == 1:
         return run(own)
-    chunks = lanes // most
-    first = [x[: chunks * most].reshape(chunks, most, *x.shape[1:]) for x in own]
-    out = jax.lax.map(run, first)
-    out = [x.reshape(chunks * most, *x.shape[2:]) for x in out]
-    if chunks * most == lanes:
-        return out
-    rest = run([x[chunks * most :] for x in own])
-    return [jnp.concatenate(pair) for pair in zip(out, rest, strict=True)]
+    # All chunks are calls of one program: the last one overlaps the one before it.
+    length = -(-lanes // chunks)
+    starts = np.minimum(length * np.arange(-(-lanes // length)), lanes - length)
+    chunk = lambda first, x: jax.lax.dynamic_slice_in_dim(x, first, length)
+    chunk_of_all = lambda first: [chunk(first, x) for x in own]
+    out = jax.lax.map(lambda first: run(chunk_of_all(first)), jnp.asarray(starts))
+    number = np.minimum(np.arange(lanes) // length, starts.size - 1)
+    return [x[number, np.arange(lanes) - starts[number]] for x in out]
 
 
 def _is_sharded(x: Array) -> bool:
