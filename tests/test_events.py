@@ -348,8 +348,10 @@ def test_all_zeros_of_a_hundred_random_functions_are_found():
         changes = np.flatnonzero(np.sign(values[1:]) != np.sign(values[:-1]))
         zeros: Any = [brentq(exact, *times[j : j + 2], xtol=1e-15) for j in changes]
         found = sol.events.ts[k][: sol.events.count[k]]
+        # Functions vanish at the start to round-off only, and may have another zero near.
+        later = found > 1e-12
+        found, rising = found[later], sol.events.happened[k][: later.size, 1][later]
         np.testing.assert_allclose(found, zeros, atol=1e-12, err_msg=str(k))  # round-off
-        rising = sol.events.happened[k][: len(zeros), 1]
         np.testing.assert_array_equal(rising, values[changes] < 0)
 
 

@@ -1,5 +1,6 @@
 """Programs as machine code: the values and derivatives of XLA, for lanes too."""
 
+import concurrent.futures
 import functools
 
 import jax
@@ -640,6 +641,32 @@ def test_lanes_have_their_own_iterations():
         alone = jax.jit(whole)(xs[lane])
         assert turns[lane] == alone[0] == np.ceil(xs[lane, 0, 0])
         np.testing.assert_array_equal(ends[lane], alone[1])
+
+
+def test_threads_share_lanes():
+    """Also of calls within loops of XLA, which run on the same threads, and of calls at the
+    same time."""
+
+    def turns(x):
+        turn = lambda c: (c[0] + 1, jnp.sin(c[1]) + x)
+        return jax.lax.while_loop(lambda c: c[0] < 5 + 10 * x, turn, (0, x))
+
+    batch = jax.vmap(in_one_function(turns))
+    alone = jax.jit(in_one_function(turns))
+    again = jax.jit(lambda x: jax.lax.fori_loop(0, 20, lambda k, y: 0.5 * batch(y)[1], x))
+    batch, lengths = jax.jit(batch), (4, 5, 9, 64, 1000)
+    xs = [jnp.linspace(0, 1, n) for n in lengths]
+    expected = [np.array([alone(x)[1] for x in of[:5]]) for of in xs]
+    in_loops = [again(x) for x in xs]
+
+    def calls(_):
+        for x, values, end in zip(xs, expected, in_loops, strict=True):
+            for _ in range(30):
+                np.testing.assert_array_equal(batch(x)[1][:5], values)
+                np.testing.assert_array_equal(again(x), end)
+
+    with concurrent.futures.ThreadPoolExecutor(4) as pool:
+        list(pool.map(calls, range(4)))
 
 
 @pytest.mark.slow

@@ -121,17 +121,6 @@ class Costs(eqx.Module):
             local_error=self.local_error + more.local_error,
         )
 
-    def by_segment(self, segment: Int[Array, " steps"], num_segments: int) -> "Costs":
-        """The costs of the steps of each segment together."""
-        add = lambda x: jax.ops.segment_sum(x, segment, num_segments)
-        largest = lambda x: jnp.maximum(jax.ops.segment_max(x, segment, num_segments), 0)
-        return Costs(
-            iterations=add(self.iterations),
-            residual=largest(self.residual),
-            halvings=largest(self.halvings),
-            local_error=add(self.local_error),
-        )
-
 
 class Record(eqx.Module):
     """What the loop returns for each group of attempted steps, along a leading axis.
@@ -339,8 +328,7 @@ class _AtGrid(AbstractSaving):
         valid = last < completed
         picked = jax.tree.map(lambda x: x[jnp.where(valid, last, 0)], steps)
         segment = jnp.minimum(jnp.searchsorted(last, _number_of_step(record)), count)
-        energies = _energies_by_segment(record.energies, segment, count)
-        costs = record.costs.by_segment(segment, count)
+        energies, costs = _by_segment(record, segment, count)
         picked = eqx.tree_at(lambda x: (x.energies, x.costs), picked, (energies, costs))
         ts = jnp.where(is_used, jax.vmap(plan.time)(places), jnp.nan)
         return _after_start(run.begin, picked, valid & is_used[1:], ts)
@@ -371,8 +359,7 @@ class _EveryAcceptedStep(AbstractSaving):
         is_used = self.every * jnp.arange(num_rows) < completed
         picked = jax.tree.map(lambda x: x[last], _accepted_first(record))
         segment = jnp.minimum(_number_of_step(record) // self.every, num_rows - 1)
-        energies = _energies_by_segment(record.energies, segment, num_rows)
-        costs = record.costs.by_segment(segment, num_rows)
+        energies, costs = _by_segment(record, segment, num_rows)
         picked = eqx.tree_at(lambda x: (x.energies, x.costs), picked, (energies, costs))
         times = jax.vmap(plan.time)(picked.place)
         ts = jnp.append(plan.t0, jnp.where(is_used, times, jnp.nan))
@@ -424,7 +411,7 @@ class _AtTimes(AbstractSaving):
         valid = inside | at_start
         details = jax.tree.map(lambda x: x[number], steps.details)
         multipliers = _nan_unless(valid, steps.multipliers[number])
-        energies = _energies_by_segment(record.energies, segment, ts.size)
+        energies, costs = _by_segment(record, segment, ts.size)
         at_start = at_start[:, None]
         return Rows(
             ts=ts,
@@ -432,7 +419,7 @@ class _AtTimes(AbstractSaving):
             multipliers=jnp.where(at_start, run.begin.multipliers[None], multipliers),
             details=jax.tree.map(lambda x: x[1:], _nan_unless(valid, details)),
             energies=_nan_unless(valid, energies),
-            costs=record.costs.by_segment(segment, ts.size),
+            costs=costs,
             varying=jax.tree.map(lambda x: x[done], _with_start(run, steps.varying)),
         )
 
@@ -512,10 +499,27 @@ def _number_of_step(record: Record) -> Int[Array, " groups"]:
     return jnp.cumsum(reached) - reached
 
 
-def _energies_by_segment(
-    energies: Energies, segment: Int[Array, " steps"], num_segments: int
-) -> Energies:
-    return jax.tree.map(lambda x: jax.ops.segment_sum(x, segment, num_segments), energies)
+def _by_segment(
+    record: Record, segment: Int[Array, " steps"], num_segments: int
+) -> tuple[Energies, Costs]:
+    """The energies and costs of the steps of each segment together; segments ascend."""
+
+    def turn(before: tuple, row: tuple) -> tuple[tuple, tuple]:
+        is_first, (energies, costs) = row
+        before = jax.tree.map(lambda x: jnp.where(is_first, jnp.zeros_like(x), x), before)
+        sums = jax.tree.map(jnp.add, before[0], energies), before[1].with_more(costs)
+        return sums, sums
+
+    rows = record.energies, record.costs
+    zeros = jax.tree.map(lambda x: jnp.zeros_like(x[0]), rows)
+    is_first = jnp.diff(segment, prepend=segment[:1] - 1) != 0
+    sums = jax.lax.scan(turn, zeros, (is_first, rows))[1]
+    numbers = jnp.arange(num_segments, dtype=segment.dtype)
+    last = jnp.maximum(jnp.searchsorted(segment, numbers, side="right") - 1, 0)
+    has_steps = segment[last] == numbers
+    return jax.tree.map(
+        lambda x: jnp.where(has_steps, x[last], jnp.zeros_like(x[last])), sums
+    )
 
 
 def _after_start(

@@ -4,8 +4,9 @@ XLA's CPU back end calls a function for each of the hundred or so array operatio
 step, and the calls take longer than the operations. Here a program becomes a graph of
 scalar operations (`graph.py`), in which zeros and known numbers are left out, and moving
 entries of arrays (`values.py`) costs nothing. Equal operations on many bodies are loops
-that use vectors, and so are the lanes of a batch (`kernels.py`). LLVM compiles the code
-(`emission.py`), and XLA calls it (`library.py`, `calls.py`).
+that use vectors, and so are the lanes of a batch (`kernels.py`), which several threads
+share (`passes.py`). LLVM compiles the code (`emission.py`), and XLA calls it
+(`library.py`, `calls.py`).
 """
 
 from .calls import (

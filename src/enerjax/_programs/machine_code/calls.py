@@ -36,8 +36,8 @@ _MOST_OF_LANES = 1_000_000
 def in_one_function(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Array]]:
     """`fn`, between trees of arrays, as one function of machine code where it can be.
 
-    The values are the same either way, but for round-off. The lanes of a batch run one
-    after the other, each with the iterations that it needs.
+    The values are the same either way, but for round-off. Several lanes of a
+    batch are computed at a time, and each has the iterations that it needs.
     """
     return functools.partial(_called, fn, False)
 
@@ -266,7 +266,7 @@ def _lanes(numbers: Any, axes: Any, *, program: Program) -> tuple[list, list[int
 def _of_lanes(
     program: Program, own: list[Array], shared: list[Array], batched: list[bool]
 ) -> list[Array]:
-    """The outputs for all lanes, in a loop in which each has the iterations that it needs."""
+    """The outputs for all lanes: each has the iterations that it needs."""
     of_lane = lambda own: program(_merged(batched, own, shared))
     if any(map(_is_sharded, own)):
         # Each device computes its own lanes.

@@ -57,8 +57,11 @@ def contraction(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value
         dict(shape=tuple(shape), broadcast_dimensions=tuple(dims), sharding=None),
     )[0]
     at = list(range(len(shape)))
-    left = spread(left, [*at[: nb + nl], *at[nb + nl + nr :]])
-    right = spread(right, [*at[:nb], *at[nb + nl : nb + nl + nr], *at[nb + nl + nr :]])
+    kept = nb + nl + nr
+    left = spread(left, [*at[: nb + nl], *at[kept:]])
+    right = spread(right, [*at[:nb], *at[nb + nl : kept], *at[kept:]])
+    if max(shape[:kept], default=0) >= max(shape[kept:], default=1):
+        left, right = (_without_lanes(self, x, kept) for x in (left, right))
     of = [dtype_of(left), dtype_of(right)]
     rule = lambda a, b: self.graph.op(
         "mul",
@@ -71,7 +74,17 @@ def contraction(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value
     product = self.map(rule, [left, right], tuple(shape), dtype)
     if nc == 0:
         return [product]
-    return [self.total("add", product, tuple(at[nb + nl + nr :]))]
+    return [self.total("add", product, tuple(at[kept:]))]
+
+
+def _without_lanes(self: "Evaluation", x: Value, first: int) -> Value:
+    """An array whose lanes are not along the axes from the first one on.
+
+    Those axes are summed over, and a sum over lanes costs more than the sum of two numbers
+    for each lane.
+    """
+    has_lanes = isinstance(x, Cells) and x.lane is not None and x.lane >= first
+    return self.cellar.memory(x) if has_lanes else x
 
 
 def _large_product(self: "Evaluation", eqn: Any, values: list[Value]) -> Value:

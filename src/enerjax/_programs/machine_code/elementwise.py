@@ -23,6 +23,29 @@ def _comparison(how: str) -> Rule:
     return lambda graph, params, dtype, of, a, b: graph.compare(how, of[0], a, b)
 
 
+def _ordered(how: str) -> Rule:
+    """The total order of sorting: -0 comes before 0, and NaN last, whatever its sign."""
+
+    def rule(graph, params, dtype, of, a, b):
+        of = of[0]
+        plain = graph.compare(how, of, a, b)
+        if of[0] != "f":
+            return plain
+        signs = [graph.op("div", of, (1.0, x)) for x in (a, b)]
+        zeros = [graph.compare("eq", of, x, 0.0) for x in (a, b)]
+        both = graph.op("and", "b1", tuple(zeros))
+        plain = graph.select("b1", both, graph.compare(how, of, *signs), plain)
+        first, last = (graph.compare("ne", of, x, x) for x in (a, b))
+        less = (
+            last
+            if how == "le"
+            else graph.op("and", "b1", (last, graph.op("not", "b1", (first,))))
+        )
+        return graph.op("or", "b1", (plain, less))
+
+    return rule
+
+
 def _abs(graph, params, dtype, of, x):
     return x if dtype[0] == "u" else graph.op("abs", dtype, (x,))
 
@@ -114,6 +137,7 @@ ELEMENTWISE: dict[str, Rule] = {
     **{name: _plain(name) for name in "max min".split()},
     **{name: _function(name) for name in FUNCTIONS - {"round", "pow"}},
     **{name: _comparison(name) for name in "eq ge gt le lt ne".split()},
+    **{f"{how}_to": _ordered(how) for how in ("le", "lt")},
     **{name: _logical(name) for name in "and not or xor".split()},
     "abs": _abs,
     "add_any": _plain("add"),

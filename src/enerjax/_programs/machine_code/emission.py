@@ -101,7 +101,7 @@ class Emission:
         self._block = "entry"
         self._run(self._root)
         body = "\n".join(self._lines)
-        head = "define internal void @main(ptr %m, ptr %w) #3 {\nentry:"
+        head = "define internal void @main(ptr %frame, ptr %m, ptr %w) #3 {\nentry:"
         return f"{head}\n{body}\n  ret void\n}}\n"
 
     def _label(self) -> str:
@@ -143,6 +143,9 @@ class Emission:
         return self._name(f"getelementptr double, ptr %m, i64 {self.address(place)}")
 
     def _scan(self, item: Scan) -> None:
+        if item.is_wide:
+            self._side_by_side(item)
+            return
         if item.body in self._recurrences:
             self._say(f"call void {self._recurrences[item.body]}(ptr %m, ptr %w)")
             return
@@ -154,35 +157,46 @@ class Emission:
         placeholder = len(self._lines)
         self._lines.append("")
         number = k
-        if item.reverse and not item.is_wide:
+        if item.reverse:
             number = self._name(f"sub i64 {item.length - 1}, {k}")
         cell = self._cell(item.counter, item.body.is_wide)
-        step, vector = 1, f"<{WIDTH} x i64>"
-        if item.is_wide:
-            # The last passes may overlap those before them, which are made again.
-            step, last = WIDTH, item.length - WIDTH
-            is_short = self._name(f"icmp ult i64 {last}, {k}")
-            number = self._name(f"select i1 {is_short}, i64 {last}, i64 {k}")
         if item.body.is_wide:
-            one = self._name(f"insertelement {vector} poison, i64 {number}, i64 0")
-            number = self._name(
-                f"shufflevector {vector} {one}, {vector} poison, "
-                f"<{WIDTH} x i32> zeroinitializer"
-            )
-            if item.is_wide:
-                numbers = ", ".join(f"i64 {x}" for x in range(WIDTH))
-                number = self._name(f"add {vector} {number}, <{numbers}>")
-            self._say(f"store {vector} {number}, ptr {cell}, align 8")
+            number = self._of_all_passes(number)
+            self._say(f"store <{WIDTH} x i64> {number}, ptr {cell}, align 8")
         else:
             self._say(f"store i64 {number}, ptr {cell}")
         self._run(item.body)
-        self._say(f"{after} = add i64 {k}, {step}")
+        self._say(f"{after} = add i64 {k}, 1")
         more = self._name(f"icmp ult i64 {after}, {item.length}")
         self._say(f"br i1 {more}, label %{loop}, label %{end}")
         self._lines[placeholder] = (
             f"  {k} = phi i64 [ 0, %{begin} ], [ {after}, %{self._block} ]"
         )
         self._start(end)
+
+    def _side_by_side(self, item: Scan) -> None:
+        """Passes that do not depend on one another: a function for several from `%k` on."""
+        outside = self._lines, self._block
+        self._lines, self._block = [], "entry"
+        vector = f"<{WIDTH} x i64>"
+        numbers = ", ".join(f"i64 {x}" for x in range(WIDTH))
+        number = self._name(f"add {vector} {self._of_all_passes('%k')}, <{numbers}>")
+        cell = self._cell(item.counter, True)
+        self._say(f"store {vector} {number}, ptr {cell}, align 8")
+        self._run(item.body)
+        body = "\n".join(self._lines)
+        name = f"@p{self._label()}"
+        head = f"define internal void {name}(ptr %m, ptr %w, i64 %k) #3 {{\nentry:"
+        self.functions.append(f"{head}\n{body}\n  ret void\n}}\n")
+        self._lines, self._block = outside
+        given = f"ptr %frame, ptr %m, ptr %w, ptr {name}, i64 {item.length}"
+        self._say(f"call void @passes({given})")
+
+    def _of_all_passes(self, number: str) -> str:
+        """A whole number, for each pass that is made at a time."""
+        vector, zeros = f"<{WIDTH} x i64>", f"<{WIDTH} x i32> zeroinitializer"
+        one = self._name(f"insertelement {vector} poison, i64 {number}, i64 0")
+        return self._name(f"shufflevector {vector} {one}, {vector} poison, {zeros}")
 
     def _while(self, item: While, region: Region) -> None:
         before, body, end = self._label(), self._label(), self._label()
@@ -246,12 +260,7 @@ class Emission:
         if is_wide:
             which = self._name(f"load {vector}, ptr {cell}, align 8")
         else:
-            one = self._name(f"load i64, ptr {cell}")
-            one = self._name(f"insertelement {vector} poison, i64 {one}, i64 0")
-            which = self._name(
-                f"shufflevector {vector} {one}, {vector} poison, "
-                f"<{WIDTH} x i32> zeroinitializer"
-            )
+            which = self._of_all_passes(self._name(f"load i64, ptr {cell}"))
         active = self._active(region)
         active = self._name(f"icmp ne {vector} {active}, splat (i64 0)")
         for k, inner in enumerate(item.branches):

@@ -25,8 +25,8 @@ class Kernel(Instructions):
     def __init__(self, emission: "Emission", nodes: list[Node], lanes: int):
         region = nodes[0].region
         self.is_wide = region.is_wide
-        # What runs once is compiled quickly, and takes one lane at a time. So is what passes
-        # of a batch do around their own loops.
+        # What runs once is compiled quickly, and takes one lane at a time. The passes of a
+        # batch compute once what is around their own loops.
         is_of_batch = self.is_wide and region.depth == 1 and bool(region.items)
         is_once = region.depth == 0 or is_of_batch
         self.step = WIDTH if lanes and not is_once and not self.is_wide else 1

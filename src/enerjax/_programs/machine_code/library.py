@@ -13,6 +13,7 @@ import numpy as np
 from .emission import Emission
 from .evaluation import Evaluation, rows_of_vectors
 from .loops import WIDTH
+from .passes import PASSES
 from .values import (
     Block,
     Cellar,
@@ -25,9 +26,9 @@ from .values import (
 )
 
 
-# The level at which LLVM optimises the code, from 0 to 3. Level 0 compiles three times as
-# fast, and its code takes twice as long. Level 2 orders the instructions once more after the
-# registers are chosen, which costs a third more and makes no difference.
+# The level at which LLVM optimises the code, from 0 to 3. At level 0 it compiles in a third
+# of the time, and the code takes twice as long. Level 2 also orders the instructions after
+# the registers are chosen, which takes a third longer, and its code is no faster.
 OPTIMISATION = 1
 
 _CODES = {"f8": "double", "f4": "float", "b1": "i8"} | {
@@ -54,9 +55,7 @@ def compiled_function(jaxpr: Any, known: Sequence[np.ndarray | None]) -> Functio
     return _function(*graph_of(jaxpr, known))
 
 
-def graph_of(
-    jaxpr: Any, known: Sequence[np.ndarray | None]
-) -> tuple[Cellar, list, list]:
+def graph_of(jaxpr: Any, known: Sequence[np.ndarray | None]) -> tuple[Cellar, list, list]:
     """The graph of a program, with the cells of its inputs and outputs.
 
     Raises `Unsupported`.
@@ -106,13 +105,16 @@ def _function(cellar: Cellar, inputs: list, outputs: list) -> Function:
     tables = [emission.addresses(x) if np.any(x >= CONSTANTS) else x for x in cellar.tables]
     # One more, because kernels may read the cell behind a number.
     size = 8 * (cellar.num_constants + cellar.size + 1)
-    handler = _HANDLER.replace("$SIZE$", str(max(size, 8)))
-    handler = handler.replace(
-        "$WIDE$", str(max(WIDTH * size, 8) if emission.has_passes else 8)
-    )
-    handler = handler.replace("$NUMBER$", str(constants.size * emission.has_passes))
-    handler = handler.replace("$CONSTANTS$", str(8 * constants.size))
-    handler = handler.replace("$COPIES_IN$", copies[0]).replace("$COPIES_OUT$", copies[1])
+    handler = (PASSES if emission.has_passes else _WITHOUT_PASSES) + _HANDLER
+    for key, value in {
+        "SIZE": size,
+        "WIDE": WIDTH * size,
+        "NUMBER": constants.size,
+        "CONSTANTS": 8 * constants.size,
+        "COPIES_IN": copies[0],
+        "COPIES_OUT": copies[1],
+    }.items():
+        handler = handler.replace(f"${key}$", str(value))
     text = "\n".join(
         [
             *sorted(emission.declared),
@@ -120,7 +122,6 @@ def _function(cellar: Cellar, inputs: list, outputs: list) -> Function:
             main,
             _helpers(),
             handler,
-            _widened(),
             "attributes #3 = { nounwind optnone noinline }",
             'attributes #0 = { nounwind noinline "no-trapping-math"="true" }',
             "attributes #2 = { nounwind noinline optnone }",
@@ -233,34 +234,14 @@ def _helpers() -> str:
     return "\n".join(out)
 
 
-def _widened() -> str:
-    """A function that copies constants, once for each pass that is made at a time."""
-    vector = f"<{WIDTH} x double>"
-    return f"""define internal void @widened(ptr %m, ptr %w, i64 %n) #0 {{
-entry:
-  br label %head
-head:
-  %k = phi i64 [ 0, %entry ], [ %next, %body ]
-  %more = icmp ult i64 %k, %n
-  br i1 %more, label %body, label %end
-body:
-  %a = getelementptr double, ptr %m, i64 %k
-  %x = load double, ptr %a
-  %one = insertelement {vector} poison, double %x, i64 0
-  %all = shufflevector {vector} %one, {vector} poison, <{WIDTH} x i32> zeroinitializer
-  %b = getelementptr {vector}, ptr %w, i64 %k
-  store {vector} %all, ptr %b, align 8
-  %next = add i64 %k, 1
-  br label %head
-end:
-  ret void
-}}
-"""
-
-
 # The function that XLA calls, by the interface of `xla/ffi/api/c_api.h`: the offsets are
 # those of its structures. In a first call it is asked for the version of the interface, and
 # answers with the one that it is called by.
+_WITHOUT_PASSES = """
+define internal ptr @passes_memory() {
+  ret ptr null
+}
+"""
 _HANDLER = """
 declare ptr @malloc(i64)
 declare void @free(ptr)
@@ -285,14 +266,13 @@ work:
   %m = call ptr @malloc(i64 $SIZE$)
   %c = inttoptr i64 $C$ to ptr
   call void @llvm.memcpy.p0.p0.i64(ptr %m, ptr %c, i64 $CONSTANTS$, i1 false)
-  %w = call ptr @malloc(i64 $WIDE$)
-  call void @widened(ptr %m, ptr %w, i64 $NUMBER$)
+  %w = call ptr @passes_memory()
   %f0 = getelementptr i8, ptr %frame, i64 72
   %args = load ptr, ptr %f0
   %f1 = getelementptr i8, ptr %frame, i64 112
   %rets = load ptr, ptr %f1
 $COPIES_IN$
-  call void @main(ptr %m, ptr %w)
+  call void @main(ptr %frame, ptr %m, ptr %w)
 $COPIES_OUT$
   call void @free(ptr %m)
   call void @free(ptr %w)

@@ -287,8 +287,7 @@ class _Carry:
         return out
 
     def read(self, region: Region) -> list[Value]:
-        for owner in self.owners:
-            owner.region, owner.ready = region, 0
+        self.evaluation.cellar.hand_over(self.owners, region, 0)
         return [
             value if places is None else Memory(dtype_of(value), places)
             for value, places in zip(self.values, self.places, strict=True)
@@ -335,11 +334,8 @@ class _Carry:
 
     def end(self, level: int) -> list[Value]:
         """The values after the loop."""
-        for owner in self.owners:
-            owner.region, owner.ready = self.evaluation.graph.current, level + 1
-        return self.read_again()
-
-    def read_again(self) -> list[Value]:
+        graph = self.evaluation.graph
+        self.evaluation.cellar.hand_over(self.owners, graph.current, level + 1)
         return [
             value if places is None else Memory(dtype_of(value), places)
             for value, places in zip(self.values, self.places, strict=True)
@@ -389,6 +385,7 @@ def _scan(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
     jaxpr, graph, cellar = closed.jaxpr, self.graph, self.cellar
     carry = _as_types(carry, closed.out_avals[:count])
     is_wide = graph.current is graph.root and count == 0 and length >= WIDTH
+    cellar.has_passes |= is_wide
     body = Region(graph.current, is_wide=is_wide)
     counter_place = cellar.new(1, Block(body, 0))
     item = Scan(body, length, reverse, counter_place, is_wide)
@@ -451,8 +448,8 @@ class _Stack:
         dtype = dtype_of(self.row)
         if math.prod(self.row.shape) == 0:
             return np.zeros((self.length, *self.row.shape), dtype)
-        for owner in self.owners:
-            owner.region, owner.ready = self.evaluation.graph.current, level + 1
+        graph = self.evaluation.graph
+        self.evaluation.cellar.hand_over(self.owners, graph.current, level + 1)
         rows = self.stride * np.arange(self.length).reshape(-1, *[1] * self.places.ndim)
         return Memory(dtype, rows + self.places)
 
@@ -554,7 +551,7 @@ def _while(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
     with _within(self, head):
         (goes_on,) = self.closed(params["cond_jaxpr"], [*outer, *cells.read(head)])
         (flag,) = self.cellar.unlaned(goes_on).ravel()
-        owner.region = head
+        self.cellar.hand_over([owner], head, 0)
         # Where several passes are made at a time, one that has ended does not begin again.
         level = _level_of(flag, head)
         _store(self, flag, "b1", flag_place, head, level, mask=flag_place)
@@ -613,8 +610,7 @@ def _cond(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
                 _stores(self, value, places, region, 0, mask=region.mask)
         results.append(Memory(dtype, places))
     _finish(self, item)
-    for owner in owners:
-        owner.region, owner.ready = graph.current, item.level + 1
+    self.cellar.hand_over(owners, graph.current, item.level + 1)
     return results
 
 

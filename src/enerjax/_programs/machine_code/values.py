@@ -110,6 +110,9 @@ class Cellar:
         self._constant_starts: list[int] = []
         self._constant_places: dict[Any, int] = {}
         self._arrays = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        # Whether some cells have a number for each of several passes.
+        self.has_passes = False
+        self._read_before: dict[tuple[bytes, str], Number] = {}
         # Tables of places that kernels read while they run.
         self.tables: list[np.ndarray] = []
         self._table_numbers: dict[bytes, int] = {}
@@ -122,6 +125,12 @@ class Cellar:
         self._owners.append(owner)
         self.size += count
         return self._starts[-1]
+
+    def hand_over(self, owners: list["Block"], region: Region, ready: int) -> None:
+        """Makes cells readable in another region, from a level on."""
+        for owner in owners:
+            owner.region, owner.ready = region, ready
+        self._read_before.clear()
 
     def scattered(self, places: np.ndarray) -> tuple[int | None, int, int]:
         """Cells as a first one and a table of distances, which other columns share.
@@ -232,11 +241,19 @@ class Cellar:
     def lanes_at(self, places: np.ndarray, dtype: str) -> Number:
         """The numbers in a cell for each lane."""
         places = self.of_one_memory(places, dtype)
+        key = places.tobytes(), dtype
+        if key not in self._read_before:
+            self._read_before[key] = self._lanes_at(places, dtype)
+        return self._read_before[key]
+
+    def _lanes_at(self, places: np.ndarray, dtype: str) -> Number:
         first, n = int(places[0]), places.size
-        steps = np.diff(places)
-        stride = int(steps[0])
-        is_affine = bool(np.all(steps == stride))
-        if is_affine and stride == 0:
+        stride = int(places[1]) - first
+        # This is much faster than the differences of so few numbers.
+        is_affine = bool(stride) and places.tolist() == list(
+            range(first, first + n * stride, stride)
+        )
+        if not stride and np.all(places == first):
             return self.number_at(first, dtype)
         owners = self._all_owners(places)
         for owner in owners:
@@ -244,19 +261,19 @@ class Cellar:
                 if owner.place == first and owner.lanes == n and not owner.is_reduced:
                     return owner
         if not is_affine:
-            shifted = self._shifted(places, steps, dtype)
+            shifted = self._shifted(places, dtype)
             if shifted is not None:
                 return shifted
         region, level, markers = self._readable(owners)
         extra = (first, stride, None) if is_affine else self.scattered(places)
         return self.graph.at(region, level, "load", dtype, markers, extra, n)
 
-    def _shifted(self, places: np.ndarray, steps: np.ndarray, dtype: str) -> Number | None:
+    def _shifted(self, places: np.ndarray, dtype: str) -> Number | None:
         """Neighbouring cells but for the first lane or the last one, which are elsewhere.
 
         All are read at once, and those of the ends are replaced.
         """
-        if places.size < 8 or not np.all(steps[1:-1] == 1):
+        if places.size < 8 or not np.all(np.diff(places[1:-1]) == 1):
             return None
         inner = places[1:-1]
         whole = np.arange(inner[0] - 1, inner[-1] + 2)
@@ -274,6 +291,8 @@ class Cellar:
 
     def of_one_memory(self, places: np.ndarray, dtype: str) -> np.ndarray:
         """The cells, or copies, such that all or none have a number for each pass."""
+        if not self.has_passes:
+            return places
         owners = self._all_owners(places.ravel())
         if len({x.region.is_wide for x in owners}) < 2:
             return places
@@ -369,11 +388,14 @@ class Cellar:
             )
 
     def _all_owners(self, places: np.ndarray) -> list[Node | Block]:
-        places = places[places < CONSTANTS]
-        if places.size == 0:
+        last = int(places.max(initial=-1))
+        if last >= CONSTANTS:
+            places = places[places < CONSTANTS]
+            last = int(places.max(initial=-1))
+        if last < 0:
             return []
         low = bisect.bisect_right(self._starts, int(places.min())) - 1
-        high = bisect.bisect_right(self._starts, int(places.max())) - 1
+        high = bisect.bisect_right(self._starts, last) - 1
         if high - low > 1:
             starts = np.array(self._starts[low : high + 1])
             numbers = np.unique(np.searchsorted(starts, places, side="right") - 1)
@@ -442,9 +464,13 @@ class Cellar:
 
 def lane_of(values: list[Value], shape: tuple[int, ...]) -> int | None:
     """The axis of the lanes of an array that is computed from others of its shape."""
+    longest = max(shape, default=0)
     for value in values:
         if isinstance(value, Cells) and value.lane is not None and value.shape == shape:
-            return value.lane
+            # The few lanes of an operand that is the same along a long axis would be many
+            # operations.
+            if 2 * value.n > longest:
+                return value.lane
     return usual_lane(shape)
 
 

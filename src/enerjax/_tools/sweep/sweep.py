@@ -56,7 +56,7 @@ def sweep(
     - `chunk`: the largest number of lanes that are computed, reported and written at a
       time; all chunks have the same length.
     - `batch_size`: how many lanes are vectorised. They all wait for the slowest of them,
-      except on CPUs, where lanes run one after the other if they can be machine code.
+      except on CPUs, where only four lanes wait for each other if they are machine code.
       By default 64 on CPUs, and all lanes of a chunk elsewhere.
     - `sort_by`: the name of the parameter that the work of a lane depends on most, such as
       `h` if all runs end at the same time. Lanes of a batch then take similar times.
