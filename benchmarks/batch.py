@@ -11,7 +11,7 @@ fastest counts. Forward runs and their gradients by the parameter. A lane is com
 its run alone, the energy with its balance, and the end with that of diffrax; a wrong answer
 is reported and not timed. Times are medians over interleaved repeats on one core with XLA's
 default settings, or on the GPU that JAX finds. At last a sweep of double pendulums runs on
-one and on two host devices, by the wall clock and on all cores of the machine.
+one and on all cores of the machine, by the wall clock.
 Writes batch.json and batch.png.
 """
 
@@ -40,7 +40,7 @@ H = 1e-3
 LANE_BOUND, ENERGY_BOUND, ERROR_BOUND, GRADIENT_BOUND = 1e-11, 1e-11, 1e-3, 1e-8
 CHUNKS = (16, 64, 256)
 G = 9.81
-# Asks a child process for the time of a sweep on all devices.
+# Asks a child process for the time of a sweep on so many cores.
 _SWEEP = "--time-of-a-sweep"
 
 
@@ -246,7 +246,7 @@ def of_work(name: str, work: Work, quick: bool) -> list[harness.Row]:
 
 
 def seconds_of_a_sweep() -> float:
-    """The time of a sweep on all devices, by the wall clock, without its compilation."""
+    """The time of a sweep by the wall clock, without its compilation."""
     run = ours(200)
     m, h = lanes(6 * 2080)
     moments: list[float] = []
@@ -260,23 +260,20 @@ def seconds_of_a_sweep() -> float:
 
 
 def rows_of_cores(quick: bool, works: Any) -> list[harness.Row]:
-    """A sweep on as many host devices as there are cores, and on one."""
+    """A sweep on one core, and on all."""
     del quick
     if "double pendulum" not in works or jax.default_backend() != "cpu":
         return []
     rows = []
-    for devices in (1, os.cpu_count() or 1):
-        flag = f"--xla_force_host_platform_device_count={devices}"
-        environment = os.environ | dict(XLA_FLAGS=flag)
+    for cores in (1, os.cpu_count() or 1):
         out = subprocess.run(
-            [sys.executable, __file__, _SWEEP],
-            env=environment,
+            [sys.executable, __file__, _SWEEP, str(cores)],
             stdout=subprocess.PIPE,
             text=True,
             check=True,
         )
         row = dict(work="double pendulum", kind="sweep", code="enerjax", mode="default")
-        rows.append(row | dict(devices=devices, seconds=json.loads(out.stdout)))
+        rows.append(row | dict(cores=cores, seconds=json.loads(out.stdout)))
     return rows
 
 
@@ -285,7 +282,7 @@ def show(rows: list[harness.Row]) -> None:
     time_of = lambda row: row.get("ns_per_lane_step", np.nan)
     for row in rows:
         if row["kind"] == "sweep":
-            print(f"sweep on {row['devices']} devices: {row['seconds']:.2f} s")
+            print(f"sweep on {row['cores']} cores: {row['seconds']:.2f} s")
             continue
         same = [x for x in rows if (x["work"], x["kind"]) == (row["work"], row["kind"])]
         ratios = ""
@@ -337,6 +334,8 @@ def draw(rows: list[harness.Row], path: Path) -> None:
 
 if __name__ == "__main__":
     if _SWEEP in sys.argv:
+        if hasattr(os, "sched_setaffinity"):
+            os.sched_setaffinity(0, range(int(sys.argv[-1])))
         jax.config.update("jax_enable_x64", True)
         print(seconds_of_a_sweep())
     else:
