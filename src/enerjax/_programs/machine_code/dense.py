@@ -3,8 +3,6 @@
 The forms for a few rows, without loops, are those of `small_matrices.py`.
 """
 
-import functools
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -12,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ..._types import Count
+from .factors import Forms, outputs
 
 
 def _column(x: Array, k: Count) -> Array:
@@ -82,42 +81,12 @@ def _substituted(
     return jax.lax.scan(turn, right, rows)[1]
 
 
-def _triangular_solve(
-    matrix: Float[Array, "n n"],
-    right: Array,
-    *,
-    left_side: bool,
-    lower: bool,
-    transpose_a: bool,
-    unit_diagonal: bool,
-) -> Array:
-    if not left_side:
-        matrix, lower, right = matrix.T, not lower, right.T
-    if transpose_a:
-        matrix, lower = matrix.T, not lower
-    if lower:
-        out = _substituted(matrix, right, unit_diagonal)
-    else:
-        out = _substituted(matrix[::-1, ::-1], right[::-1], unit_diagonal)[::-1]
-    return out if left_side else out.T
-
-
-def _of_each(fn: Callable, num_axes: int, *values: Array) -> Any:
-    """`fn` of the last axes of arrays, for all entries of the others."""
-    for _ in values[0].shape[: values[0].ndim - num_axes]:
-        fn = jax.vmap(fn)
-    return fn(*values)
+_FORMS = Forms(_cholesky, _lu, _substituted)
 
 
 def factors_by_loops(name: str, values: list[Array], params: dict[str, Any]) -> list[Array]:
     """The outputs of `lu`, `cholesky` or `triangular_solve`."""
-    if name == "cholesky":
-        return [_of_each(_cholesky, 2, *values)]
-    if name == "lu":
-        return list(_of_each(_lu, 2, *values))
-    keys = "left_side lower transpose_a unit_diagonal".split()
-    how = {key: params[key] for key in keys}
-    return [_of_each(functools.partial(_triangular_solve, **how), 2, *values)]
+    return outputs(name, values, params, _FORMS)
 
 
 BY_LOOPS = frozenset("cholesky lu triangular_solve".split())

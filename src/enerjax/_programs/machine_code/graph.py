@@ -415,26 +415,20 @@ def _simpler_not(graph, dtype, operands, extra):
     return a.operands[0] if a.op == "not" else None
 
 
-def _simpler_and(graph, dtype, operands, extra):
-    a, b = operands
-    if a is b:
-        return a
-    if dtype == "b1":
-        for x, y in ((a, b), (b, a)):
-            if not isinstance(x, Node):
-                return y if x else False
-    return None
+def _simpler_logical(decisive: bool) -> Callable[..., Number | None]:
+    """Of `and`, which one False decides, or of `or`, which one True decides."""
 
+    def simpler(graph, dtype, operands, extra):
+        a, b = operands
+        if a is b:
+            return a
+        if dtype == "b1":
+            for x, y in ((a, b), (b, a)):
+                if not isinstance(x, Node):
+                    return decisive if x == decisive else y
+        return None
 
-def _simpler_or(graph, dtype, operands, extra):
-    a, b = operands
-    if a is b:
-        return a
-    if dtype == "b1":
-        for x, y in ((a, b), (b, a)):
-            if not isinstance(x, Node):
-                return True if x else y
-    return None
+    return simpler
 
 
 def _simpler_extreme(graph, dtype, operands, extra):
@@ -455,7 +449,7 @@ def _simpler_convert(graph, dtype, operands, extra):
 
 _SIMPLER: dict[str, Callable[[Graph, str, Any, Any], Number | None]] = {
     "add": _simpler_add,
-    "and": _simpler_and,
+    "and": _simpler_logical(False),
     "convert": _simpler_convert,
     "div": _simpler_div,
     "max": _simpler_extreme,
@@ -463,7 +457,7 @@ _SIMPLER: dict[str, Callable[[Graph, str, Any, Any], Number | None]] = {
     "mul": _simpler_mul,
     "neg": _simpler_neg,
     "not": _simpler_not,
-    "or": _simpler_or,
+    "or": _simpler_logical(True),
     "select": _simpler_select,
     "sub": _simpler_sub,
 }

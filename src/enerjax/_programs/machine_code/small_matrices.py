@@ -5,7 +5,6 @@ operations, and it keeps the program around it from being one function.
 """
 
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -13,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..._types import Count
+from .factors import Forms, of_each, outputs
 
 
 # The number of rows up to which matrices are small, and that of entries which are sorted.
@@ -41,26 +41,6 @@ def _substituted(
         rows.append(row)
         right = right[1:] - matrix[k + 1 :, k, None] * row
     return jnp.concatenate(rows)
-
-
-def _triangular_solve(
-    matrix: Float[Array, "n n"],
-    right: Array,
-    *,
-    left_side: bool,
-    lower: bool,
-    transpose_a: bool,
-    unit_diagonal: bool,
-) -> Array:
-    if not left_side:
-        matrix, lower, right = matrix.T, not lower, right.T
-    if transpose_a:
-        matrix, lower = matrix.T, not lower
-    if lower:
-        out = _substituted(matrix, right, unit_diagonal)
-    else:
-        out = _substituted(matrix[::-1, ::-1], right[::-1], unit_diagonal)[::-1]
-    return out if left_side else out.T
 
 
 def _lu(
@@ -129,15 +109,7 @@ def _is_before(a: Array, b: Array) -> Bool[Array, "..."]:
     return (a < b) | (jnp.isnan(b) & ~jnp.isnan(a))
 
 
-def _of_each(fn: Callable, num_axes: int, *values: Array) -> Any:
-    """`fn` of the last axes of arrays, for all entries of the others."""
-    batch = values[0].shape[: values[0].ndim - num_axes]
-    for _ in batch:
-        fn = jax.vmap(fn)
-    return fn(*values)
-
-
-_TRIANGULAR = "left_side lower transpose_a unit_diagonal".split()
+_FORMS = Forms(_cholesky, _lu, _substituted)
 
 
 def in_plain_operations(
@@ -147,17 +119,12 @@ def in_plain_operations(
     if name == "sort":
         axis = params["dimension"]
         moved = [jnp.moveaxis(x, axis, -1) for x in values]
-        out = _of_each(lambda *xs: _sorted(list(xs)), 1, *moved)
+        out = of_each(lambda *xs: _sorted(list(xs)), 1, *moved)
         return [jnp.moveaxis(x, -1, axis) for x in out]
-    if name == "cholesky":
-        return [_of_each(_cholesky, 2, *values)]
-    if name == "triangular_solve":
-        how = {key: params[key] for key in _TRIANGULAR}
-        return [_of_each(functools.partial(_triangular_solve, **how), 2, *values)]
-    if name == "lu":
-        return list(_of_each(_lu, 2, *values))
+    if name != "lu_pivots_to_permutation":
+        return outputs(name, values, params, _FORMS)
     size = params["permutation_size"]
-    return [_of_each(functools.partial(_order_after, permutation_size=size), 1, *values)]
+    return [of_each(functools.partial(_order_after, permutation_size=size), 1, *values)]
 
 
 def is_small(eqn: Any) -> bool:
