@@ -291,7 +291,19 @@ def carries(x):
     ]
 
 
+def searched(x):
+    """Also for zeros of both signs, and for NaN, which comes last."""
+    table = jnp.array([-jnp.inf, -1.0, -0.0, 0.0, 0.5, jnp.inf, jnp.nan, jnp.nan])
+    keys = jnp.append(x[0], jnp.array([0.0, -0.0, jnp.inf, jnp.nan, -jnp.nan]))
+    return [
+        jnp.searchsorted(jnp.sort(x[0]), x[1]),
+        *(jnp.searchsorted(table, keys, side=side) for side in ("left", "right")),
+        jnp.searchsorted(jnp.asarray(TWICE), jnp.arange(4)),
+    ]
+
+
 PROGRAMS = {
+    "searched": searched,
     "shifted": shifted,
     "carries": carries,
     "put": lambda x: x.at[ROWS, COLUMNS].set(jnp.cos(x[:2, :2])),
