@@ -472,6 +472,7 @@ def _frequencies_under_load(section, length, force, count):
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_modes_about_a_loaded_equilibrium():
     """A pull and half of the critical load, on a beam on a pin and a roller."""
     section = ej.Section(EA=2e4, GA=8e3, EI=50.0, rhoA=2.0, rhoI=0.01)

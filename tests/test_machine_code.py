@@ -13,6 +13,8 @@ from enerjax._programs import at_places, in_one_function, why_not_one_function
 from enerjax._programs.machine_code import emission, loops
 from enerjax._solvers.linear.dense import Inverse
 
+from .helpers import long
+
 
 pytestmark = pytest.mark.skipif(
     jax.default_backend() != "cpu", reason="machine code is for CPUs"
@@ -341,7 +343,7 @@ PROGRAMS = {
 }
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
+@pytest.mark.parametrize("name", long(PROGRAMS, "long sums"))
 def test_values_and_derivatives(name):
     fn = PROGRAMS[name]
     other = in_one_function(fn)

@@ -160,7 +160,9 @@ def test_inputs_that_become_constants_are_passed_as_inputs():
     np.testing.assert_allclose(rate, difference, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", long(["four_bar", "car_axis", "heavy_top"], "car_axis"))
+@pytest.mark.parametrize(
+    "name", long(["four_bar", "car_axis", "heavy_top"], "car_axis", "heavy_top")
+)
 def test_runs_and_their_derivatives_are_one_function(name):
     system, start, args = getattr(ej.problems, name)()
     run = lambda args: ej.simulate(
