@@ -18,6 +18,9 @@ from .values import CONSTANTS, Unsupported
 if TYPE_CHECKING:
     from .emission import Emission
 
+# Such as the rows of a run: what is computed for each of them counts.
+_MANY_LANES = 64
+
 
 class Kernel(Instructions):
     """The function of a kernel."""
@@ -28,7 +31,7 @@ class Kernel(Instructions):
         # What runs once is compiled quickly, and takes one lane at a time. The passes of a
         # batch compute once what is around their own loops.
         is_of_batch = self.is_wide and region.depth == 1 and bool(region.items)
-        is_once = region.depth == 0 or is_of_batch
+        is_once = (region.depth == 0 or is_of_batch) and lanes < _MANY_LANES
         self.step = WIDTH if lanes and not is_once and not self.is_wide else 1
         vector = WIDTH if self.is_wide else self.step
         super().__init__(vector, emission.declared)
