@@ -296,9 +296,7 @@ class Cellar:
         owners = self._all_owners(places.ravel())
         if len({x.region.is_wide for x in owners}) < 2:
             return places
-        region = self.graph.current
-        while region.parent is not None and region.parent.is_wide:
-            region = region.parent
+        region = self._outermost_of_passes()
         copies = {}
         for place in np.unique(places).tolist():
             if place < CONSTANTS and not self.is_wide(place):
@@ -445,21 +443,34 @@ class Cellar:
         if flat.size < 2 or np.all(np.diff(flat) == 1):
             return Memory(memory.dtype, flat.reshape(memory.shape))
         if flat.size < _FEWEST_LANES:
-            copies = [
-                self.graph.node(
-                    "copy",
-                    memory.dtype,
-                    (self.number_at(int(p), memory.dtype),),
-                    (k, self.size),
-                )
-                for k, p in enumerate(flat)
-            ]
-            places = np.array([self.place_of(x, memory.dtype) for x in copies])
+            has_passes = any(self.is_wide(int(p)) for p in flat)
+            places = np.array(
+                [
+                    self._copied(int(p), memory.dtype, (k, self.size), has_passes)
+                    for k, p in enumerate(flat)
+                ]
+            )
             return Memory(memory.dtype, places.reshape(memory.shape))
         x = self.lanes_at(flat, memory.dtype)
         copy = self.graph.node("copy", memory.dtype, (x,), lanes=flat.size)
         places = self.place_of(copy, memory.dtype) + np.arange(flat.size)
         return Memory(memory.dtype, places.reshape(memory.shape))
+
+    def _copied(self, place: int, dtype: str, extra: Any, has_passes: bool) -> int:
+        """The cell of a copy; of a known number, too, there is one for each pass."""
+        x = self.number_at(place, dtype)
+        if has_passes and not isinstance(x, Node):
+            copy = self.graph.at(self._outermost_of_passes(), 0, "copy", dtype, (x,), extra)
+        else:
+            copy = self.graph.node("copy", dtype, (x,), extra)
+        return self.place_of(copy, dtype)
+
+    def _outermost_of_passes(self) -> Region:
+        """The region that is run as a whole for several passes at a time."""
+        region = self.graph.current
+        while region.parent is not None and region.parent.is_wide:
+            region = region.parent
+        return region
 
 
 def lane_of(values: list[Value], shape: tuple[int, ...]) -> int | None:
