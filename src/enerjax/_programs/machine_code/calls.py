@@ -282,7 +282,7 @@ def _of_lanes(
     wanted, lanes = [True] * len(program.jaxpr.outvars), len(own[0])
     size = sum(math.prod(x.aval.shape) for x in program.jaxpr.outvars)
     chunks = -(-lanes * max(size, 1) // _MOST_OF_LANES)
-    if chunks == 1:
+    if chunks <= 1:
         return run(own)
     # All chunks are calls of one program: the last one overlaps the one before it.
     length = -(-lanes // chunks)
