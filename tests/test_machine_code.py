@@ -10,10 +10,10 @@ import pytest
 from jax.ad_checkpoint import checkpoint_name
 
 from enerjax._programs import at_places, in_one_function, why_not_one_function
-from enerjax._programs.machine_code import emission, loops
+from enerjax._programs.machine_code import emission, library, loops
 from enerjax._solvers.linear.dense import Inverse
 
-from .helpers import long
+from .helpers import EPS, long
 
 
 pytestmark = pytest.mark.skipif(
@@ -689,6 +689,40 @@ def test_threads_share_lanes():
 
     with concurrent.futures.ThreadPoolExecutor(4) as pool:
         list(pool.map(calls, range(4)))
+
+
+def long_branch(x):
+    """A loop with a branch of so many operations that it is compiled when it is taken."""
+    turns = jnp.arange(60.0).reshape(20, 3)
+
+    def branch(x):
+        for k in range(20):
+            x = jnp.sin(x + turns[k]) + jnp.roll(x, 1) * jnp.outer(x, turns[k])[0, 1:2]
+        return jax.lax.cond(x[0] > 0, lambda x: x / (2 + x**2), jnp.cos, x)
+
+    turn = lambda k, x: jax.lax.cond(x[k % 3] > 0.5, branch, lambda x: x + 0.1, x)
+    return jax.lax.fori_loop(0, 6, turn, x)
+
+
+def test_a_long_branch_is_compiled_when_it_is_taken(monkeypatch):
+    monkeypatch.setattr(emission, "_LARGE_BRANCH", 50)
+    kept = library._library()._kept
+    before = set(kept)
+    fn = jax.jit(in_one_function(long_branch))
+    never, often = jnp.full(3, -1.0), jnp.array([0.6, 0.2, 0.9])
+    np.testing.assert_allclose(fn(never), never + 0.6, rtol=4 * EPS)
+    (name,) = set(kept) - before
+    assert len(kept[name]._engines) == 1
+    expected = jax.jit(long_branch)(often)
+    # Round-off of the sums in six turns.
+    np.testing.assert_allclose(fn(often), expected, rtol=1e-13, atol=1e-13)
+    assert len(kept[name]._engines) == 2
+    np.testing.assert_array_equal(fn(often), fn(often))
+    assert len(kept[name]._engines) == 2
+    # Several threads come to the branches of a batch at the same time.
+    xs = jnp.linspace(-2, 1, 600).reshape(200, 3)
+    batch = jax.jit(jax.vmap(in_one_function(long_branch)))
+    np.testing.assert_allclose(batch(xs), jax.vmap(long_branch)(xs), rtol=0, atol=1e-12)
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """The graph of a program as code for LLVM: its kernels, and a function that calls them."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -13,19 +13,25 @@ from .values import Cellar, CONSTANTS
 # Kernels of single numbers with more operations are divided: the time of compilation grows
 # faster than their length.
 _LONGEST = 2_500
+# Branches of more operations are compiled when one is first taken. Most runs never need
+# Newton's method or a division of a step, which are more than half of their program.
+_LARGE_BRANCH = 1_000
 
 
 class Emission:
     """The code of a program.
 
-    - `functions`, `main`: the kernels, and the function that has the loops and branches.
-    - `declared`: the functions from outside that they call.
+    - `functions`: the kernels, and `@main`, which has the loops and branches, by name.
+    - `late`: for each branch that is compiled when it is first taken, its kernels and
+      `@branch`, which calls them.
+    - `declared`: the functions from outside that these call.
     - `length`: the number of operations.
     """
 
     def __init__(self, cellar: Cellar):
         self.cellar, self._root = cellar, cellar.graph.root
-        self.functions: list[str] = []
+        self.functions: dict[str, str] = {}
+        self.late: list[dict[str, str]] = []
         self.declared: set[str] = {
             f"declare i1 @llvm.vector.reduce.or.v{WIDTH}i1(<{WIDTH} x i1>)"
         }
@@ -43,17 +49,23 @@ class Emission:
         loops = recurrences(regions, kernels, _LONGEST)
         self._make_places(kernels, loops)
         self._recurrences = {}
+        self._texts: dict[Region, dict[str, str]] = {region: {} for region in regions}
+        self._sizes: dict[Region, int] = dict.fromkeys(regions, 0)
         for region, (item, nodes) in loops.items():
             name = self._recurrences[region] = f"@r{len(self._recurrences)}"
-            self.functions.append(Recurrence(self, nodes, item).text(name))
+            self._texts[region][name] = Recurrence(self, nodes, item).text(name)
         self._by_region: dict[Region, dict[int, list[str]]] = {}
         for number, ((region, level, lanes, _), nodes) in enumerate(kernels.items()):
+            self._sizes[region] += len(nodes)
             if region not in loops:
                 name = f"@k{number}"
-                self.functions.append(Kernel(self, nodes, lanes).text(name))
+                self._texts[region][name] = Kernel(self, nodes, lanes).text(name)
                 levels = self._by_region.setdefault(region, {})
                 levels.setdefault(level, []).append(name)
-        self.main = self._main()
+        self._lines: list[str] = []
+        self._labels = 0
+        self._block = "entry"
+        self._function("internal", "@main", "ptr %frame, ptr %m, ptr %w", self._root)
 
     def address(self, place: int) -> int:
         """The number of a cell in the memory: constants come first."""
@@ -95,14 +107,22 @@ class Emission:
 
     # The function for the whole -----------------------------------------------------------
 
-    def _main(self) -> str:
-        self._lines: list[str] = []
-        self._labels = 0
-        self._block = "entry"
-        self._run(self._root)
+    def _function(
+        self,
+        linkage: str,
+        name: str,
+        parameters: str,
+        region: Region,
+        first: Sequence[str] = (),
+    ) -> None:
+        """A function that runs a region, after some lines."""
+        outside = self._lines, self._block
+        self._lines, self._block = list(first), "entry"
+        self._run(region)
         body = "\n".join(self._lines)
-        head = "define internal void @main(ptr %frame, ptr %m, ptr %w) #3 {\nentry:"
-        return f"{head}\n{body}\n  ret void\n}}\n"
+        head = f"define {linkage} void {name}({parameters}) #3 {{\nentry:"
+        self.functions[name] = f"{head}\n{body}\n  ret void\n}}\n"
+        self._lines, self._block = outside
 
     def _label(self) -> str:
         self._labels += 1
@@ -121,6 +141,7 @@ class Emission:
         self._block = label
 
     def _run(self, region: Region) -> None:
+        self.functions |= self._texts[region]
         kernels = self._by_region.get(region, {})
         items: dict[int, list] = {}
         for item in region.items:
@@ -147,6 +168,7 @@ class Emission:
             self._side_by_side(item)
             return
         if item.body in self._recurrences:
+            self.functions |= self._texts[item.body]
             self._say(f"call void {self._recurrences[item.body]}(ptr %m, ptr %w)")
             return
         loop, end = self._label(), self._label()
@@ -176,19 +198,15 @@ class Emission:
 
     def _side_by_side(self, item: Scan) -> None:
         """Passes that do not depend on one another: a function for several from `%k` on."""
-        outside = self._lines, self._block
-        self._lines, self._block = [], "entry"
         vector = f"<{WIDTH} x i64>"
         numbers = ", ".join(f"i64 {x}" for x in range(WIDTH))
+        outside, self._lines = self._lines, []
         number = self._name(f"add {vector} {self._of_all_passes('%k')}, <{numbers}>")
         cell = self._cell(item.counter, True)
         self._say(f"store {vector} {number}, ptr {cell}, align 8")
-        self._run(item.body)
-        body = "\n".join(self._lines)
+        first, self._lines = self._lines, outside
         name = f"@p{self._label()}"
-        head = f"define internal void {name}(ptr %m, ptr %w, i64 %k) #3 {{\nentry:"
-        self.functions.append(f"{head}\n{body}\n  ret void\n}}\n")
-        self._lines, self._block = outside
+        self._function("internal", name, "ptr %m, ptr %w, i64 %k", item.body, first)
         given = f"ptr %frame, ptr %m, ptr %w, ptr {name}, i64 {item.length}"
         self._say(f"call void @passes({given})")
 
@@ -248,9 +266,24 @@ class Emission:
         self._say(f"switch i64 {which}, label %{labels[-1]} [ {cases} ]")
         for label, inner in zip(labels, item.branches, strict=True):
             self._start(label)
-            self._run(inner)
+            self._run_branch(inner)
             self._say(f"br label %{end}")
         self._start(end)
+
+    def _run_branch(self, region: Region) -> None:
+        within = list(_all_regions(region))
+        # Passes on all cores are called from `@main`.
+        has_passes = not region.is_wide and any(x.is_wide for x in within)
+        if has_passes or sum(self._sizes[x] for x in within) <= _LARGE_BRANCH:
+            self._run(region)
+            return
+        outside, self.functions = self.functions, {}
+        number = len(self.late)
+        self.late.append(self.functions)
+        self._function("", "@branch", "ptr %m, ptr %w", region)
+        self.functions = outside
+        branch = self._name(f"call ptr @late(i64 {number})")
+        self._say(f"call void {branch}(ptr %m, ptr %w)")
 
     def _branch_of_passes(self, item, region: Region) -> None:
         """Every branch that a pass takes, for the passes that take it."""
@@ -271,7 +304,7 @@ class Emission:
             self._say(f"store {vector} {wide}, ptr {self._cell(inner.mask, True)}, align 8")
             self._say(f"br i1 {self._any(taken)}, label %{on}, label %{off}")
             self._start(on)
-            self._run(inner)
+            self._run_branch(inner)
             self._say(f"br label %{off}")
             self._start(off)
 

@@ -4,6 +4,8 @@ import ctypes
 import functools
 import hashlib
 import re
+import threading
+import zlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -98,7 +100,6 @@ def graph_of(jaxpr: Any, known: Sequence[np.ndarray | None]) -> tuple[Cellar, li
 
 def _function(cellar: Cellar, inputs: list, outputs: list) -> Function:
     emission = Emission(cellar)
-    main = emission.main
     copies = _copies(emission, inputs, outputs)
     constants = np.concatenate([np.zeros(0, np.int64), *cellar.constants])
     # Tables of distances have no constants' cells.
@@ -115,25 +116,29 @@ def _function(cellar: Cellar, inputs: list, outputs: list) -> Function:
         "COPIES_OUT": copies[1],
     }.items():
         handler = handler.replace(f"${key}$", str(value))
-    text = "\n".join(
+    texts = [
+        _module(emission, [*emission.functions.values(), _helpers(), _LATE, handler]),
+        *(_module(emission, list(functions.values())) for functions in emission.late),
+    ]
+    digest = hashlib.sha256("".join(texts).encode())
+    for x in (constants, *tables):
+        digest.update(x.tobytes())
+    name = f"enerjax_{digest.hexdigest()[:32]}"
+    _library().add(name, texts, constants, tables)
+    return Function(name, emission.length)
+
+
+def _module(emission: Emission, functions: Sequence[str]) -> str:
+    return "\n".join(
         [
             *sorted(emission.declared),
-            *emission.functions,
-            main,
-            _helpers(),
-            handler,
+            *functions,
             "attributes #3 = { nounwind optnone noinline }",
             'attributes #0 = { nounwind noinline "no-trapping-math"="true" }',
             "attributes #2 = { nounwind noinline optnone }",
             "attributes #1 = { nounwind willreturn memory(none) }",
         ]
     )
-    digest = hashlib.sha256(text.encode())
-    for x in (constants, *tables):
-        digest.update(x.tobytes())
-    name = f"enerjax_{digest.hexdigest()[:32]}"
-    _library().add(name, text, constants, tables)
-    return Function(name, emission.length)
 
 
 def _copies(emission: Emission, inputs: list, outputs: list) -> tuple[str, str]:
@@ -281,27 +286,61 @@ $COPIES_OUT$
 """
 
 
-class _Library:
-    """The compiled functions of this process. They stay, because XLA may call them."""
+# The function of a branch, which is compiled if it has not been.
+_LATE = """
+declare void @llvm.trap()
+define internal ptr @late(i64 %number) #0 {
+entry:
+  %slot = getelementptr ptr, ptr inttoptr (i64 $BRANCHES$ to ptr), i64 %number
+  %known = load atomic ptr, ptr %slot acquire, align 8
+  %is_new = icmp eq ptr %known, null
+  br i1 %is_new, label %new, label %end
+new:
+  %made = call ptr inttoptr (i64 $COMPILE$ to ptr)(i64 %number)
+  %fails = icmp eq ptr %made, null
+  br i1 %fails, label %failed, label %end
+failed:
+  call void @llvm.trap()
+  unreachable
+end:
+  %branch = phi ptr [ %known, %entry ], [ %made, %new ]
+  ret ptr %branch
+}
+"""
 
-    def __init__(self):
-        import llvmlite.binding as llvm
 
-        self._llvm = llvm
-        llvm.initialize_native_target()
-        llvm.initialize_native_asmprinter()
-        self._kept: dict[str, Any] = {}
+class _Compiled:
+    """Code in memory, and all that it refers to.
 
-    def add(
-        self, name: str, text: str, constants: np.ndarray, tables: list[np.ndarray]
-    ) -> None:
-        if name in self._kept:
-            return
-        llvm = self._llvm
-        constants = np.ascontiguousarray(constants)
-        tables = [np.ascontiguousarray(x) for x in tables]
-        addresses = {f"T{k}": x.ctypes.data for k, x in enumerate(tables)}
-        addresses["C"] = constants.ctypes.data
+    Branches that are compiled when they are first taken are kept as text until then.
+    """
+
+    def __init__(self, texts: list[str], constants: np.ndarray, tables: list[np.ndarray]):
+        self._constants = np.ascontiguousarray(constants)
+        self._tables = [np.ascontiguousarray(x) for x in tables]
+        self._branches = np.zeros(len(texts), np.uintp)
+        self._compile = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_int64)(self._branch)
+        self._lock = threading.Lock()
+        self._engines: list[Any] = []
+        main, *late = texts
+        self._late = {k: zlib.compress(x.encode(), 1) for k, x in enumerate(late)}
+        self.address = self._address(main, "handler")
+
+    def _branch(self, number: int) -> int:
+        # Several threads may come to a branch at the same time.
+        with self._lock:
+            if number in self._late:
+                text = zlib.decompress(self._late.pop(number)).decode()
+                self._branches[number] = self._address(text, "branch")
+            return int(self._branches[number])
+
+    def _address(self, text: str, name: str) -> int:
+        """Where the function of this name is."""
+        llvm = _llvm()
+        addresses = {f"T{k}": x.ctypes.data for k, x in enumerate(self._tables)}
+        addresses["C"] = self._constants.ctypes.data
+        addresses["BRANCHES"] = self._branches.ctypes.data
+        addresses["COMPILE"] = ctypes.cast(self._compile, ctypes.c_void_p).value
         text = re.sub(r"\$(\w+)\$", lambda found: str(addresses[found[1]]), text)
         module = llvm.parse_assembly(text)
         module.verify()
@@ -317,12 +356,35 @@ class _Library:
         engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), target)
         engine.add_object_file(llvm.ObjectFileRef.from_data(code))
         engine.finalize_object()
-        address = engine.get_function_address("handler")
-        capsule = jax.ffi.pycapsule(ctypes.cast(address, ctypes.c_void_p))
+        self._engines.append(engine)
+        return engine.get_function_address(name)
+
+
+class _Library:
+    """The compiled functions of this process. They stay, because XLA may call them."""
+
+    def __init__(self):
+        self._kept: dict[str, _Compiled] = {}
+
+    def add(
+        self, name: str, texts: list[str], constants: np.ndarray, tables: list[np.ndarray]
+    ) -> None:
+        if name in self._kept:
+            return
+        compiled = self._kept[name] = _Compiled(texts, constants, tables)
+        capsule = jax.ffi.pycapsule(ctypes.c_void_p(compiled.address))
         jax.ffi.register_ffi_target(name, capsule, platform="cpu")
-        self._kept[name] = engine, constants, tables
 
 
 @functools.cache
 def _library() -> _Library:
     return _Library()
+
+
+@functools.cache
+def _llvm() -> Any:
+    import llvmlite.binding as llvm
+
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    return llvm
