@@ -692,13 +692,16 @@ def test_threads_share_lanes():
 
 
 def long_branch(x):
-    """A loop with a branch of so many operations that it is compiled when it is taken."""
+    """A loop with branches of so many operations that they are compiled when taken."""
     turns = jnp.arange(60.0).reshape(20, 3)
 
-    def branch(x):
+    def many(x):
         for k in range(20):
             x = jnp.sin(x + turns[k]) + jnp.roll(x, 1) * jnp.outer(x, turns[k])[0, 1:2]
-        return jax.lax.cond(x[0] > 0, lambda x: x / (2 + x**2), jnp.cos, x)
+        return x
+
+    def branch(x):
+        return jax.lax.cond(x[0] > 0.55, many, jnp.cos, many(x))
 
     turn = lambda k, x: jax.lax.cond(x[k % 3] > 0.5, branch, lambda x: x + 0.1, x)
     return jax.lax.fori_loop(0, 6, turn, x)
@@ -716,9 +719,9 @@ def test_a_long_branch_is_compiled_when_it_is_taken(monkeypatch):
     expected = jax.jit(long_branch)(often)
     # Round-off of the sums in six turns.
     np.testing.assert_allclose(fn(often), expected, rtol=1e-13, atol=1e-13)
-    assert len(kept[name]._engines) == 2
+    assert len(kept[name]._engines) == 3
     np.testing.assert_array_equal(fn(often), fn(often))
-    assert len(kept[name]._engines) == 2
+    assert len(kept[name]._engines) == 3
     # Several threads come to the branches of a batch at the same time.
     xs = jnp.linspace(-2, 1, 600).reshape(200, 3)
     batch = jax.jit(jax.vmap(in_one_function(long_branch)))

@@ -4,7 +4,9 @@ import ctypes
 import functools
 import hashlib
 import re
+import sys
 import threading
+import traceback
 import zlib
 from collections.abc import Sequence
 from typing import Any
@@ -117,8 +119,11 @@ def _function(cellar: Cellar, inputs: list, outputs: list) -> Function:
     }.items():
         handler = handler.replace(f"${key}$", str(value))
     texts = [
-        _module(emission, [*emission.functions.values(), _helpers(), _LATE, handler]),
-        *(_module(emission, list(functions.values())) for functions in emission.late),
+        _module(emission, [*functions.values(), *others])
+        for functions, others in [
+            (emission.functions, [_LATE, _helpers(), handler]),
+            *((functions, [_LATE]) for functions in emission.late),
+        ]
     ]
     digest = hashlib.sha256("".join(texts).encode())
     for x in (constants, *tables):
@@ -328,11 +333,16 @@ class _Compiled:
 
     def _branch(self, number: int) -> int:
         # Several threads may come to a branch at the same time.
-        with self._lock:
-            if number in self._late:
-                text = zlib.decompress(self._late.pop(number)).decode()
-                self._branches[number] = self._address(text, "branch")
-            return int(self._branches[number])
+        try:
+            with self._lock:
+                if number in self._late:
+                    text = zlib.decompress(self._late.pop(number)).decode()
+                    self._branches[number] = self._address(text, "branch")
+                return int(self._branches[number])
+        except BaseException:
+            # No exception can pass through machine code, which ends the process.
+            traceback.print_exc(file=sys.__stderr__)
+            return 0
 
     def _address(self, text: str, name: str) -> int:
         """Where the function of this name is."""
