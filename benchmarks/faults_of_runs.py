@@ -220,6 +220,14 @@ FAULTS = (
         of("machine_code::test_values_and_derivatives"),
     ),
     Fault(
+        "machine code: which branch is compiled",
+        "_programs/machine_code/emission.py",
+        "        number = len(self.late)\n",
+        "        number = len(self.late) % 1\n",
+        "Of the branches that are compiled when they are taken, all are the first one.",
+        of("machine_code::test_a_long_branch_is_compiled_when_it_is_taken"),
+    ),
+    Fault(
         "machine code: a scan that goes backwards",
         "_programs/machine_code/emission.py",
         "        if item.reverse:\n",

@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import functools
+import time
 
 import jax
 import jax.numpy as jnp
@@ -726,6 +727,26 @@ def test_a_long_branch_is_compiled_when_it_is_taken(monkeypatch):
     xs = jnp.linspace(-2, 1, 600).reshape(200, 3)
     batch = jax.jit(jax.vmap(in_one_function(long_branch)))
     np.testing.assert_allclose(batch(xs), jax.vmap(long_branch)(xs), rtol=0, atol=1e-12)
+
+
+def test_an_interrupt_while_a_branch_is_compiled_comes_after_it(monkeypatch):
+    """No exception can pass through machine code."""
+    monkeypatch.setattr(emission, "_LARGE_BRANCH", 50)
+    compile_text, names = library._Compiled._address, []
+
+    def interrupted(self, text, name):
+        names.append(name)
+        if names.count("branch") == 1:
+            raise KeyboardInterrupt
+        return compile_text(self, text, name)
+
+    monkeypatch.setattr(library._Compiled, "_address", interrupted)
+    fn, x = lambda x: 2 * long_branch(x), jnp.array([0.6, 0.2, 0.9])
+    with pytest.raises(KeyboardInterrupt):
+        found = jax.block_until_ready(jax.jit(in_one_function(fn))(x))
+        time.sleep(5)
+    assert names[:3] == ["handler", "branch", "branch"]
+    np.testing.assert_allclose(found, jax.jit(fn)(x), rtol=1e-13, atol=1e-13)
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Code for LLVM, compiled for this machine, as a function that XLA calls."""
 
+import _thread
 import ctypes
 import functools
 import hashlib
@@ -332,17 +333,30 @@ class _Compiled:
         self.address = self._address(main, "handler")
 
     def _branch(self, number: int) -> int:
+        """Called by machine code, through which no exception can pass."""
+        is_interrupted = False
+        while True:
+            try:
+                address = self._compiled_branch(number)
+                if is_interrupted:
+                    # The interrupt comes again when Python runs its own code.
+                    threading.Timer(0.01, _thread.interrupt_main).start()
+                return address
+            except KeyboardInterrupt:
+                is_interrupted = True
+            except BaseException:
+                traceback.print_exc(file=sys.__stderr__)
+                # The process ends.
+                return 0
+
+    def _compiled_branch(self, number: int) -> int:
         # Several threads may come to a branch at the same time.
-        try:
-            with self._lock:
-                if number in self._late:
-                    text = zlib.decompress(self._late.pop(number)).decode()
-                    self._branches[number] = self._address(text, "branch")
-                return int(self._branches[number])
-        except BaseException:
-            # No exception can pass through machine code, which ends the process.
-            traceback.print_exc(file=sys.__stderr__)
-            return 0
+        with self._lock:
+            if number in self._late:
+                text = zlib.decompress(self._late[number]).decode()
+                self._branches[number] = self._address(text, "branch")
+                del self._late[number]
+            return int(self._branches[number])
 
     def _address(self, text: str, name: str) -> int:
         """Where the function of this name is."""
