@@ -364,7 +364,7 @@ class _Compiled:
         addresses = {f"T{k}": x.ctypes.data for k, x in enumerate(self._tables)}
         addresses["C"] = self._constants.ctypes.data
         addresses["BRANCHES"] = self._branches.ctypes.data
-        addresses["COMPILE"] = ctypes.cast(self._compile, ctypes.c_void_p).value
+        addresses["COMPILE"] = ctypes.cast(self._compile, ctypes.c_void_p).value or 0
         text = re.sub(r"\$(\w+)\$", lambda found: str(addresses[found[1]]), text)
         module = llvm.parse_assembly(text)
         module.verify()
