@@ -196,14 +196,6 @@ FAULTS = (
         of("machine_code::test_lanes_equal_single_calls"),
     ),
     Fault(
-        "machine code: the cell before the rows",
-        "_programs/machine_code/kernels.py",
-        "self._has_passes(first + stride)",
-        "self._has_passes(first)",
-        "Rows of a lane are read from the memory of a number that all lanes share.",
-        of("machine_code::test_lanes_equal_single_calls"),
-    ),
-    Fault(
         "machine code: ends of rows",
         "_programs/machine_code/values.py",
         "            if places[end] != whole[end]:\n",
