@@ -11,8 +11,9 @@ from .values import Cellar, CONSTANTS
 
 
 # Kernels of single numbers with more operations are divided: the time of compilation grows
-# faster than their length.
-_LONGEST = 2_500
+# faster than their length. It grows most for loops over lanes. Those that run once and have
+# few lanes are divided too; for the rows of a run it would take longer to write and read.
+_LONGEST, _LONGEST_OF_LANES, _FEW_LANES = 2_500, 300, 256
 # Branches of more operations are compiled when one is first taken. Most runs never need
 # Newton's method or a division of a step, which are more than half of their program.
 _LARGE_BRANCH = 1_000
@@ -333,15 +334,19 @@ def _kernels(regions: list[Region]) -> dict[tuple, list[Node]]:
         stack.extend(x for x in node.operands if isinstance(x, Node) and x not in live)
     order = {region: k for k, region in enumerate(regions)}
     needed = [x for x in live if x.op not in NOT_COMPUTED and x.region in order]
-    needed.sort(key=lambda x: (order[x.region], x.level, x.lanes, x.number))
+    # Loops over lanes that are divided write last, when all that they read is read.
+    is_divided = lambda x: x.region.depth == 0 and 0 < x.lanes < _FEW_LANES
+    is_late = lambda x: x.op == "store" and is_divided(x)
+    needed.sort(key=lambda x: (order[x.region], x.level, x.lanes, is_late(x), x.number))
     kernels: dict[tuple, list[Node]] = {}
     parts: dict[tuple, int] = {}
     for node in needed:
         key = node.region, node.level, node.lanes
         part = parts.get(key, 0)
         # Numbers of a carry are all read before the first is written.
-        is_full = len(kernels.get((*key, part), ())) >= _LONGEST
-        if is_full and not node.lanes and node.op != "store":
+        longest = _LONGEST_OF_LANES if node.lanes else _LONGEST
+        is_full = len(kernels.get((*key, part), ())) >= longest
+        if is_full and node.op != "store" and (is_divided(node) or not node.lanes):
             part = parts[key] = part + 1
         kernels.setdefault((*key, part), []).append(node)
     return kernels
