@@ -1,5 +1,6 @@
 """The graph of a program as code for LLVM: its kernels, and a function that calls them."""
 
+import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -272,6 +273,7 @@ class Emission:
         self._start(end)
 
     def _run_branch(self, region: Region) -> None:
+        """Runs a branch, as a function of its own if it is large."""
         within = list(_all_regions(region))
         # Passes on all cores are called from `@main`.
         has_passes = not region.is_wide and any(x.is_wide for x in within)
@@ -317,6 +319,14 @@ def _all_regions(region: Region) -> Iterable[Region]:
             yield from _all_regions(inner)
 
 
+def _longest(node: Node) -> float:
+    """The most operations in a kernel of such a node."""
+    if not node.lanes:
+        return _LONGEST
+    is_divided = node.region.depth == 0 and node.lanes < _FEW_LANES
+    return _LONGEST_OF_LANES if is_divided else math.inf
+
+
 def _kernels(regions: list[Region]) -> dict[tuple, list[Node]]:
     """The operations that are needed, by kernel."""
     live: set[Node] = set()
@@ -335,8 +345,7 @@ def _kernels(regions: list[Region]) -> dict[tuple, list[Node]]:
     order = {region: k for k, region in enumerate(regions)}
     needed = [x for x in live if x.op not in NOT_COMPUTED and x.region in order]
     # Loops over lanes that are divided write last, when all that they read is read.
-    is_divided = lambda x: x.region.depth == 0 and 0 < x.lanes < _FEW_LANES
-    is_late = lambda x: x.op == "store" and is_divided(x)
+    is_late = lambda x: x.op == "store" and x.lanes > 0 and _longest(x) < math.inf
     needed.sort(key=lambda x: (order[x.region], x.level, x.lanes, is_late(x), x.number))
     kernels: dict[tuple, list[Node]] = {}
     parts: dict[tuple, int] = {}
@@ -344,9 +353,8 @@ def _kernels(regions: list[Region]) -> dict[tuple, list[Node]]:
         key = node.region, node.level, node.lanes
         part = parts.get(key, 0)
         # Numbers of a carry are all read before the first is written.
-        longest = _LONGEST_OF_LANES if node.lanes else _LONGEST
-        is_full = len(kernels.get((*key, part), ())) >= longest
-        if is_full and node.op != "store" and (is_divided(node) or not node.lanes):
+        is_full = len(kernels.get((*key, part), ())) >= _longest(node)
+        if is_full and node.op != "store":
             part = parts[key] = part + 1
         kernels.setdefault((*key, part), []).append(node)
     return kernels

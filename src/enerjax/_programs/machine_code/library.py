@@ -292,7 +292,7 @@ $COPIES_OUT$
 """
 
 
-# The function of a branch, which is compiled if it has not been.
+# Where the function of a branch is. The first call compiles it.
 _LATE = """
 declare void @llvm.trap()
 define internal ptr @late(i64 %number) #0 {
