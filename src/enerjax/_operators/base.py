@@ -41,6 +41,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from .._discrete import AbstractCorrected, AbstractDerivative
+from .._programs import call_traced_once
 from .._solvers import Assembled, RowPattern, SchurTables, Symmetric
 from .._system import AbstractSystem, State
 from .._types import (
@@ -294,7 +295,7 @@ class AbstractModel(eqx.Module):
         """The matrix `A(q)`."""
         if self.system.nonholonomic is None:
             return jnp.zeros((0, q.size), q.dtype)
-        return self.system.nonholonomic(q, self.args)
+        return call_traced_once(self.system.nonholonomic, q, self.args)
 
     def joint_near(
         self, at: Coordinates, t: Time
@@ -361,14 +362,14 @@ class AbstractModel(eqx.Module):
         """The constraint of the user; it does not depend on time."""
         if self.system.constraint is None:
             return jnp.zeros((0,), q.dtype)
-        return self.system.constraint(q, self.args)
+        return call_traced_once(self.system.constraint, q, self.args)
 
     def driven(self, q: Coordinates, t: Time) -> Float[Array, " nd"]:
         """The driven (rheonomic) constraints, which depend on time."""
         if self.system.driven is None:
             return jnp.zeros((0,), q.dtype)
         assert t is not None
-        return self.system.driven(q, t, self.args)
+        return call_traced_once(self.system.driven, q, t, self.args)
 
     def joint(self, q: Coordinates, t: Time) -> JointMultipliers:
         """The constraints that can be imposed at velocity level: fixed, then driven."""
@@ -445,7 +446,7 @@ class AbstractModel(eqx.Module):
         """`f(q, v, t)` at the velocities of the user."""
         assert self.system.force is not None
         assert t is not None
-        return self.system.force(q, v, t, self.args)
+        return call_traced_once(self.system.force, q, v, t, self.args)
 
     def damping(self, q: Coordinates, v: Velocities, t: Time) -> Velocities:
         """The part of `f` that is odd in the velocity."""

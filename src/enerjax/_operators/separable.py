@@ -25,6 +25,7 @@ from .._discrete import (
     ChainRule,
     RotationRule,
 )
+from .._programs import call_traced_once
 from .._solvers import (
     affine_root,
     as_dense,
@@ -162,7 +163,7 @@ class SeparableModel(AbstractModel):
         return self._potential(state.q)
 
     def _potential(self, q: Coordinates) -> Scalar:
-        return self.system.potential(q, self.args)
+        return call_traced_once(self.system.potential, q, self.args)
 
     def momentum(self, state: State) -> Velocities:
         return self.inertia @ state.v

@@ -4,6 +4,7 @@ from . import primitives as primitives
 from .batching import in_any_lane as in_any_lane
 from .compiled import (
     at_top_level as at_top_level,
+    call_traced_once as call_traced_once,
     compiled as compiled,
     compiled_for_once as compiled_for_once,
     once_per_structure as once_per_structure,

@@ -25,6 +25,8 @@ _FOR_ONCE = _QUICKLY | {"xla_backend_optimization_level": 0}
 
 Arguments = ParamSpec("Arguments")
 Value = TypeVar("Value")
+_Static: TypeAlias = tuple[tuple[tuple[Any, ...], tuple[Any, ...]], Any]
+_Structure: TypeAlias = tuple[_Static, tuple[jax.ShapeDtypeStruct, ...]]
 
 
 def compiled(fn: Callable[Arguments, Value]) -> Callable[Arguments, Value]:
@@ -87,6 +89,21 @@ class Readable:
         return jax.jit(of_parts, static_argnums=0, compiler_options=options)
 
 
+def call_traced_once(fn: Callable[..., PyTree[Array]], *args: Any) -> PyTree[Array]:
+    """`fn(*args)`, as one operation whose program is traced once for all such calls.
+
+    To trace a function of the user takes longer than all else that a program does with it.
+    """
+    static, arrays = _parts((fn, args))
+    return _function_of_user(static, arrays) if is_hashable(static) else fn(*args)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _function_of_user(static: _Static, arrays: list[Array]) -> PyTree[Array]:
+    fn, args = _joined(static, arrays)
+    return fn(*args)
+
+
 def once_per_structure(check: Callable[..., None]) -> Callable[..., None]:
     """A check of shapes and types that is not repeated for arguments of the same structure.
 
@@ -124,10 +141,6 @@ def is_hashable(x: Any) -> bool:
     except TypeError:
         return False
     return True
-
-
-_Static: TypeAlias = tuple[tuple[tuple[Any, ...], tuple[Any, ...]], Any]
-_Structure: TypeAlias = tuple[_Static, tuple[jax.ShapeDtypeStruct, ...]]
 
 
 def _parts(tree: PyTree[Any]) -> tuple[_Static, list[Array]]:

@@ -5,6 +5,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from .._programs import call_traced_once
 from .._solvers import BlockDiagonal, hessian, in_blocks, Symmetric
 from .._types import Args, Coordinates, Scalar, Vector, Velocities
 from .base import (
@@ -178,12 +179,12 @@ class System(AbstractSystem):
     def kinetic_energy(self, state: State, args: Args = None) -> Scalar:
         """`1/2 v . M v` of one state (energy)."""
         if callable(self.kinetic):
-            return self.kinetic(state.v, args)
+            return call_traced_once(self.kinetic, state.v, args)
         return 0.5 * state.v @ self.kinetic @ state.v
 
     def potential_energy(self, state: State, args: Args = None) -> Scalar:
         """`V(q)` of one state (energy)."""
-        return self.potential(state.q, args)
+        return call_traced_once(self.potential, state.q, args)
 
     def energy(self, state: State, args: Args = None) -> Scalar:
         """Total energy `1/2 v . M v + V(q)` of one state."""

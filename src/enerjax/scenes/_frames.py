@@ -37,14 +37,14 @@ class Frame(NamedTuple):
         """A point of the body in space, linear in the origin and the axes."""
         return self.origin + self.direction(point)
 
-    def direction(self, direction: Point) -> Point:
-        """A direction of the body in space."""
+    def direction(self, direction: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
+        """A direction of the body in space, or several as rows."""
         if self.axes is None:
             return direction
-        return jnp.sum(direction[:, None] * self.axes, axis=0)
+        return direction @ self.axes
 
     def components(self, direction: Point) -> Point:
         """A direction in space, in the axes of the body."""
         if self.axes is None:
             return direction
-        return jnp.sum(self.axes * direction[None], axis=1)
+        return self.axes @ direction

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._programs import at_places
 from .._run import Impact
 from .._system import Names, RigidBodies, System
 from .._types import Coordinates, Multipliers, Scalar, Velocities
@@ -19,7 +20,7 @@ from ._laws import AbstractForceLaw, Acting, Driven, Gap
 from ._layout import Layout, Links
 from ._motion_view import Moving
 from ._parameters import Parameters
-from ._pose_view import evaluate, evaluate_slip, lift, rows, View
+from ._pose_view import evaluate, evaluate_slip, lift, View
 from ._potential import PotentialOfScene
 from ._user_functions import ask, vector_of
 
@@ -78,12 +79,12 @@ def _restitution(layout: Layout, k: int, args: Parameters) -> Scalar:
 
 def kinetic(layout: Layout, v: Velocities, args: Parameters) -> Scalar:
     energies = [
-        jnp.sum(jax.vmap(group.kind.kinetic)(rows(v, group.v), numbers))
+        jnp.sum(jax.vmap(group.kind.kinetic)(at_places(v, group.v), numbers))
         for group, numbers in numbers_of_bodies(layout, args)
     ]
     groups = zip(layout.inerter_groups, args.tables["inerters"], strict=True)
     for group, numbers in groups:
-        energies.append(0.5 * jnp.sum(numbers["inertance"] * rows(v, group.v) ** 2))
+        energies.append(0.5 * jnp.sum(numbers["inertance"] * at_places(v, group.v) ** 2))
     return sum(energies[1:], start=energies[0])
 
 
@@ -122,7 +123,8 @@ def inerters_at(
     """All inerters, with numbers that include the value of their coordinate."""
     groups = zip(layout.inerter_groups, args.tables["inerters"], strict=True)
     return [
-        (group.links, numbers | dict(value=rows(q, group.q))) for group, numbers in groups
+        (group.links, numbers | dict(value=at_places(q, group.q)))
+        for group, numbers in groups
     ]
 
 
@@ -211,14 +213,14 @@ def velocity_map(layout: Layout, q: Coordinates, args: Parameters) -> Float[Arra
     full = jnp.asarray(matrix, q.dtype)
     for group in layout.body_groups:
         if group.kind.num_redundant:
-            blocks = jax.vmap(group.kind.velocity_map)(rows(q, group.q))
+            blocks = jax.vmap(group.kind.velocity_map)(at_places(q, group.q))
             full = full.at[group.v[:, :, None], group.q[:, None, :]].set(blocks)
     return full
 
 
 def redundancy(layout: Layout, q: Coordinates, args: Parameters) -> Multipliers:
     parts = [
-        jax.vmap(group.kind.redundant)(rows(q, group.q)).reshape(-1)
+        jax.vmap(group.kind.redundant)(at_places(q, group.q)).reshape(-1)
         for group in layout.body_groups
         if group.kind.num_redundant
     ]

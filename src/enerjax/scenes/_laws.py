@@ -10,11 +10,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
-import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 from typing_extensions import TypeAliasType
 
+from .._programs import at_places
 from .._types import Args, Multipliers, Scalar
 from ._frames import Frame, Numbers, Point
 from ._measures import AbstractLaw, AbstractMeasure, offset, Separation
@@ -72,12 +73,11 @@ class Alignment(AbstractConstraintLaw):
             return apart
         rows = [apart]
         if self.along is not None:
-            along = jax.vmap(a.direction)(_chosen(numbers["frame_a"], self.along))
-            rows = [jnp.sum(apart[None] * along, axis=1)]
+            rows = [a.direction(_chosen(numbers["frame_a"], self.along)) @ apart]
         if self.square:
             i, j = zip(*self.square, strict=True)
-            of_a = jax.vmap(a.direction)(_chosen(numbers["frame_a"], i))
-            of_b = jax.vmap(b.direction)(_chosen(numbers["frame_b"], j))
+            of_a = a.direction(_chosen(numbers["frame_a"], i))
+            of_b = b.direction(_chosen(numbers["frame_b"], j))
             rows.append(jnp.sum(of_a * of_b, axis=1))
         return jnp.concatenate(rows)
 
@@ -85,7 +85,7 @@ class Alignment(AbstractConstraintLaw):
 def _chosen(frame: Array, axes: Sequence[int]) -> Array:
     """Some axes of a frame, shape `(n, d)`; a single one if all are the same."""
     chosen = axes[:1] if len(set(axes)) == 1 else axes
-    return jnp.stack([frame[k] for k in chosen])
+    return at_places(frame, np.array(chosen))
 
 
 @dataclass(frozen=True)

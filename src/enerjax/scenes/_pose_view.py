@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._programs import is_known
+from .._programs import at_places, is_known
 from .._types import Coordinates, Scalar, Vector, Velocities
 from ._frames import Frame, Point
 from ._laws import AbstractNonholonomicLaw
@@ -17,14 +17,6 @@ from ._layout import Layout, Links
 # Frames of less than this part of the bodies are computed for these bodies alone: a pin at
 # one end of a beam needs no axes of all of its sections.
 _FEW = 0.25
-
-
-def rows(x: Array, index: np.ndarray) -> Array:
-    """`x[index]`, which is a slice if the indices are consecutive."""
-    first = index.flat[0]
-    if np.array_equal(index.ravel(), np.arange(first, first + index.size)):
-        return x[first : first + index.size].reshape(index.shape + x.shape[1:])
-    return x[index]
 
 
 class View:
@@ -82,7 +74,7 @@ class View:
             chosen = chosen[(chosen >= 0) & (chosen < count)]
             first += count
             if chosen.size > 0:
-                q = rows(self.q, group.q[chosen])
+                q = at_places(self.q, group.q[chosen])
                 parts.append(jax.vmap(getattr(group.kind, field))(q))
         return jnp.concatenate(parts)
 
@@ -90,11 +82,11 @@ class View:
         """A field of some bodies, stacked; that of a few is computed for these alone."""
         few = np.unique(bodies[bodies > 0])
         if few.size > _FEW * len(self.layout.turning):
-            return rows(getattr(self, table), bodies)
+            return at_places(getattr(self, table), bodies)
         found = self._table(field, few)
         if field == "axes":
             found = self._without_second(found)
-        return rows(found, np.where(bodies > 0, 1 + np.searchsorted(few, bodies), 0))
+        return at_places(found, np.where(bodies > 0, 1 + np.searchsorted(few, bodies), 0))
 
     def frames(self, bodies: np.ndarray, reads: tuple[str, ...]) -> Frame:
         """The frames of some bodies, stacked, with the fields that are read."""
@@ -193,7 +185,7 @@ def lift(layout: Layout, q: Coordinates, v: Velocities) -> Coordinates:
         return v
     rates = jnp.zeros_like(q)
     for group in layout.body_groups:
-        lifted = jax.vmap(group.kind.lift)(rows(q, group.q), rows(v, group.v))
+        lifted = jax.vmap(group.kind.lift)(at_places(q, group.q), at_places(v, group.v))
         rates = rates.at[group.q].set(lifted)
     for group in layout.inerter_groups:
         rates = rates.at[group.q].set(v[group.v])

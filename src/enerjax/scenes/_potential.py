@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from .._programs import at_places
 from .._system import AbstractStrainEnergy
 from .._types import Coordinates, Scalar
 from ._beam_functions import (
@@ -17,7 +18,7 @@ from ._frames import Numbers
 from ._laws import AbstractForceLaw, Elastic
 from ._layout import Layout, Links
 from ._parameters import Parameters
-from ._pose_view import evaluate, rows, View
+from ._pose_view import evaluate, View
 from ._user_functions import ask
 
 
@@ -88,7 +89,7 @@ def _weight(view: View, args: Parameters) -> Scalar:
     """The work of gravity on all bodies, from the origin to their positions."""
     work = jnp.zeros((), view.q.dtype)
     for group, numbers in numbers_of_bodies(view.layout, args):
-        origins = jax.vmap(group.kind.origin)(rows(view.q, group.q))
+        origins = jax.vmap(group.kind.origin)(at_places(view.q, group.q))
         forces = numbers["mass"][:, None] * args["gravity"][None, :]
         work = work + jnp.sum(forces * origins)
     return work

@@ -245,9 +245,7 @@ def product(a: Float[Array, "n k"], b: Any) -> Float[Array, "n m"]:
     """`a @ b`, which XLA fuses with its surroundings where both are small arrays."""
     if a.shape[1] > SMALL or not isinstance(b, jax.Array):
         return a @ b
-    # A sum over the rows of `b`: the inner loop runs over contiguous entries.
-    terms = [a[:, k, None] * b[None, k] for k in range(a.shape[1])]
-    return functools.reduce(jnp.add, terms) if terms else a @ b
+    return jnp.sum(a[:, :, None] * b[None], axis=1)
 
 
 def _defect(matrix: Array, inverse: Array) -> tuple[Array, Scalar]:

@@ -1,5 +1,3 @@
-import functools
-
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -21,6 +19,5 @@ def largest(x: Array) -> Scalar:
     # XLA does not vectorise a reduction to a single number.
     width = -(-sizes.size // _PIECES)
     if width > 1:
-        pieces = jnp.pad(sizes, (0, -sizes.size % width)).reshape(-1, width)
-        sizes = functools.reduce(jnp.maximum, pieces)
+        sizes = jnp.max(jnp.pad(sizes, (0, -sizes.size % width)).reshape(-1, width), axis=0)
     return jnp.max(sizes, initial=0.0)

@@ -277,9 +277,7 @@ def _blocks(tables: SchurTables, rows: Array, weighted: Array) -> tuple[Array, A
 
     def blocks(table: np.ndarray) -> Array:
         one, other = at_places(left, table[0]), at_places(right, table[1])
-        terms = (one[:, k, :, None] * other[:, k, None] for k in range(table.shape[2]))
-        shape = (table.shape[1], tables.width, tables.width)
-        return functools.reduce(jnp.add, terms, jnp.zeros(shape, rows.dtype))
+        return jnp.sum(one[..., None] * other[:, :, None], axis=1)
 
     padding = jnp.asarray(tables.padding, rows.dtype)
     return blocks(tables.diagonal) + padding, blocks(tables.below)
@@ -303,6 +301,4 @@ def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def _times(a: Float[Array, "m n"], b: Float[Array, "n k"]) -> Float[Array, "m k"]:
-    # In this form the innermost loop goes along a row of `b`, and uses vectors.
-    terms = (a[:, k, None] * b[None, k] for k in range(a.shape[1]))
-    return functools.reduce(jnp.add, terms)
+    return jnp.sum(a[:, :, None] * b[None], axis=1)

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..._programs import compiled_for_once, is_known
+from ..._programs import call_traced_once, compiled_for_once, is_known
 from ..._solvers import is_positive_definite, scaled_blocks, Symmetric
 from ..._types import Args, Flag
 from ..base import AbstractSystem, State
@@ -31,23 +31,27 @@ def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]
     if isinstance(system, System):
         constraints.append(system.coordinate_constraint)
     potential = lambda q: system.potential_energy(State(q, jnp.zeros_like(state.v)), args)
-    rows_of = [lambda q, fn=fn: fn(q, args) for fn in constraints if fn is not None]
+    rows_of = [
+        lambda q, fn=fn: call_traced_once(fn, q, args)
+        for fn in constraints
+        if fn is not None
+    ]
     # A row that depends on `q` changes along this direction.
     along = direction_without_symmetry(state.q)
     rates = [jax.jvp(fn, (state.q,), (along,))[1] for fn in rows_of]
     slopes = jnp.concatenate([jnp.zeros((0,), state.q.dtype), *rates])
     timed, t = [], state.t
     if system.force is not None and t is not None:
-        timed.append(system.force(state.q, state.v, t, args))
+        timed.append(call_traced_once(system.force, state.q, state.v, t, args))
     if system.driven is not None and t is not None:
-        timed.append(system.driven(state.q, t, args))
+        timed.append(call_traced_once(system.driven, state.q, t, args))
     facts = dict(
         **_nonholonomic(system, state, args),
         start=finite(state),
         args=finite([x for x in jax.tree.leaves(args) if eqx.is_inexact_array(x)]),
         potential=finite(system.potential_energy(state, args)),
         timed=finite(timed),
-        constraint=finite([f(state.q, args) for f in constraints if f is not None]),
+        constraint=finite([rows(state.q) for rows in rows_of]),
         slope=finite(jax.grad(potential)(state.q)),
         slopes=finite(slopes),
         depends=jnp.array(system.redundant) | jnp.all(slopes != 0),

@@ -28,11 +28,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..._discrete import ANGLE, elementary, OTHER, RotationRule
-from ..._programs import Indices
+from ..._programs import at_places, Indices
 from ..._types import Increments
 from .base import AbstractAddedKinematics
 from .plain import AbstractIndependentKinematics
-from .rigid_bodies import check_indices, entries, joined
+from .rigid_bodies import check_indices, joined
 
 
 class AbstractPlanarKinematics(AbstractIndependentKinematics):
@@ -80,10 +80,10 @@ class PlanarRotations(AbstractPlanarKinematics):
     def displacement(self, q, step):
         table = self.table.array
         others = np.setdiff1d(np.arange(step.size), table)
-        bodies = entries(step, table).reshape(-1, 3)
+        bodies = at_places(step, table)
         turned = 2 * jnp.arctan(0.5 * bodies[:, 2:])
         moved = jnp.concatenate([bodies[:, :2], turned], axis=1).ravel()
-        return joined(moved, table, entries(step, others), others)
+        return joined(moved, table, at_places(step, others), others)
 
     def pull_back(self, qa, qb, step, gradient):
         half = self._half_turns(step)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._programs import Indices
+from ..._programs import at_places, Indices
 from ..._types import Coordinates, Velocities
 from .vectors import Axes, Vector3
 
@@ -73,12 +73,12 @@ class RigidBodies(Indices):
 
     def pose(self, q: Coordinates) -> Pose:
         """The mass centres and directors of all bodies, or their rates or gradients."""
-        rows = entries(q, self.q).reshape(-1, 12).T
+        rows = at_places(q, self.q).T
         return rows[:3], rows[3:].reshape(3, 3, -1)
 
     def vectors(self, v: Velocities) -> tuple[Vector3, Vector3]:
         """The translational and the rotational parts of the velocities."""
-        rows = entries(v, self.v).reshape(-1, 6).T
+        rows = at_places(v, self.v).T
         return rows[:3], rows[3:]
 
     def coordinates(self, pose: Pose, others: Float[Array, " n"]) -> Coordinates:
@@ -96,15 +96,15 @@ class RigidBodies(Indices):
 
     def others(self, q: Coordinates) -> Float[Array, " n"]:
         """The coordinates that belong to no rigid body."""
-        return entries(q, self.other_q)
+        return at_places(q, self.other_q)
 
     def other_rates(self, v: Velocities) -> Float[Array, " n"]:
         """The velocities that belong to no rigid body."""
-        return entries(v, self.other_v)
+        return at_places(v, self.other_v)
 
     def constraint(self, q: Coordinates) -> Float[Array, " 6*bodies"]:
         """The products of the directors less those of orthonormal ones, body by body."""
-        axes = entries(q, self.q).reshape(-1, 4, 3)[:, 1:]
+        axes = at_places(q, self.q).reshape(-1, 4, 3)[:, 1:]
         products = jnp.sum(axes[:, _LEFT] * axes[:, _RIGHT], axis=2)
         return (products - jnp.asarray(_LEFT == _RIGHT, q.dtype)[None]).ravel()
 
@@ -121,20 +121,8 @@ class RigidBodies(Indices):
 _LEFT, _RIGHT = np.array([0, 1, 2, 1, 2, 0]), np.array([0, 1, 2, 2, 0, 1])
 
 
-def entries(x: Array, index: np.ndarray) -> Array:
-    """`x[index]`, which is a slice if the indices are consecutive."""
-    flat = index.ravel()
-    if flat.size == 0:
-        return x[:0]
-    if np.array_equal(flat, np.arange(flat[0], flat[0] + flat.size)):
-        return x[flat[0] : flat[0] + flat.size]
-    return x[flat]
-
-
 def joined(x: Array, at: np.ndarray, y: Array, others: np.ndarray) -> Array:
     """The entries of `x` at the indices `at`, and those of `y` at `others`."""
     places = np.concatenate([at.ravel(), others])
     both = x if others.size == 0 else jnp.concatenate([x, y])
-    if np.array_equal(places, np.arange(places.size)):
-        return both
-    return both[np.argsort(places)]
+    return at_places(both, np.argsort(places))
