@@ -99,6 +99,8 @@ def _in_segments(
 
 def _unless(done: Callable[[Any], Array], segment: Body) -> Body:
     """`segment`, which is skipped if it would change nothing."""
+    # Both branches need its program, which is traced once.
+    segment = jax.jit(segment)
 
     def skipped(carry: Any, inputs: Any) -> tuple[Any, Any]:
         _, out = jax.eval_shape(segment, carry, inputs)

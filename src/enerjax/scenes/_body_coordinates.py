@@ -9,8 +9,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from .._programs import at_places
 from .._types import Coordinates, Multipliers, Scalar, Velocities
 from ._frames import Numbers, Point
 
@@ -125,8 +127,8 @@ class PlanarBodies(AbstractBodyCoordinates):
         return [*q, "angle"], [*v, "angle_rate"]
 
     def axes(self, q):
-        c, s = jnp.cos(q[2]), jnp.sin(q[2])
-        return jnp.stack([jnp.stack([c, s]), jnp.stack([-s, c])])
+        first = jnp.stack([jnp.cos(q[2]), jnp.sin(q[2])])
+        return at_places(jnp.concatenate([first, -first]), np.array([[0, 1], [3, 0]]))
 
     def angle(self, q):
         return q[2]

@@ -14,9 +14,9 @@ from ._laws import AbstractNonholonomicLaw
 from ._layout import Layout, Links
 
 
-# Frames of less than this part of the bodies are computed for these bodies alone: a pin at
-# one end of a beam needs no axes of all of its sections.
-_FEW = 0.25
+# Of more bodies than this, frames of less than this part are computed for these bodies
+# alone: a pin at one end of a beam needs no axes of all of its sections.
+_MANY, _FEW = 16, 0.25
 
 
 class View:
@@ -36,24 +36,7 @@ class View:
 
     @cached_property
     def axes(self) -> Float[Array, "bodies d d"]:
-        return self._with_second(self._first_axes)
-
-    @cached_property
-    def _first_axes(self) -> Float[Array, "bodies n d"]:
-        """In the plane the first axis alone, from which the second follows; all in space.
-
-        To find an axis in a table takes longer than to turn one.
-        """
-        return self._without_second(self._table("axes"))
-
-    def _without_second(self, axes: Float[Array, "n d d"]) -> Float[Array, "n m d"]:
-        return axes[:, :1] if self.layout.dimension == 2 else axes
-
-    def _with_second(self, first: Float[Array, "n m d"]) -> Float[Array, "n d d"]:
-        if self.layout.dimension == 3:
-            return first
-        normal = jnp.stack([-first[..., 1], first[..., 0]], axis=-1)
-        return jnp.concatenate([first, normal], axis=1)
+        return self._table("axes")
 
     @cached_property
     def angles(self) -> Float[Array, " bodies"]:
@@ -80,12 +63,10 @@ class View:
 
     def _of(self, field: str, table: str, bodies: np.ndarray) -> Array:
         """A field of some bodies, stacked; that of a few is computed for these alone."""
-        few = np.unique(bodies[bodies > 0])
-        if few.size > _FEW * len(self.layout.turning):
+        few, count = np.unique(bodies[bodies > 0]), len(self.layout.turning)
+        if count <= _MANY or few.size > _FEW * count:
             return at_places(getattr(self, table), bodies)
         found = self._table(field, few)
-        if field == "axes":
-            found = self._without_second(found)
         return at_places(found, np.where(bodies > 0, 1 + np.searchsorted(few, bodies), 0))
 
     def frames(self, bodies: np.ndarray, reads: tuple[str, ...]) -> Frame:
@@ -94,7 +75,7 @@ class View:
         if "origin" in reads:
             fields["origin"] = self._origins_of(bodies)
         if "axes" in reads and self.layout.turning[bodies].any():
-            fields["axes"] = self._with_second(self._of("axes", "_first_axes", bodies))
+            fields["axes"] = self._of("axes", "axes", bodies)
         if "angle" in reads:
             fields["angle"] = self._of("angle", "angles", bodies)
         return Frame(**fields)
