@@ -19,7 +19,7 @@ from enerjax._solvers import Chord, find_root, Newton, schur, schur_tables
 from enerjax._solvers.linear.block_diagonal import in_blocks
 from enerjax._solvers.linear.krylov import solver_by_products
 
-from .helpers import EPS, SCHEMES
+from .helpers import EPS, long, SCHEMES
 
 
 SIZE = 30
@@ -176,8 +176,16 @@ def test_without_stiffness_one_correction_solves_the_step(name, size):
     assert left <= 1e4 * EPS  # round-off
 
 
-@pytest.mark.parametrize("joined", [False, True])
-@pytest.mark.parametrize("name", [x for x in CHORDS if x not in ("consistent", "momentum")])
+WITH_MOMENTA = [x for x in CHORDS if x not in ("consistent", "momentum")]
+AND_JOINTS = [
+    pytest.param(x, True, marks=[] if x == "preserving" else pytest.mark.slow)
+    for x in WITH_MOMENTA
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "joined"), [*((x, False) for x in WITH_MOMENTA), *AND_JOINTS]
+)
 def test_with_momenta_one_correction_solves_the_step_too(name, joined):
     """With a constant inertia, declared as if it varied."""
     rng = np.random.default_rng(0)
@@ -194,8 +202,12 @@ def test_with_momenta_one_correction_solves_the_step_too(name, joined):
     assert left <= 1e4 * EPS  # round-off
 
 
+REDUNDANT = [x for x in CHORDS if "consistent" not in x and x != "momentum"]
+
+
 @pytest.mark.parametrize(
-    "name", [x for x in CHORDS if "consistent" not in x and x != "momentum"]
+    "name",
+    long(REDUNDANT, *(x for x in REDUNDANT if x not in ("preserving", "decaying 0"))),
 )
 def test_redundant_coordinates_take_one_correction_too(name):
     """With a constant map to the velocities, and constant relations of the coordinates."""
@@ -404,7 +416,7 @@ def test_what_is_round_off_grows_with_the_system(searched_by):
     assert jnp.max(jnp.abs(sol.audit.leak)) <= 512 * EPS * jnp.ptp(sol.audit.potential)
 
 
-@pytest.mark.parametrize("damped", [False, True])
+@pytest.mark.parametrize("damped", long([False, True], True))
 def test_stiff_forces_are_noticed_before_the_first_program(searched_by, damped):
     """A row of points on springs, or in dampers, of ten radians a step."""
     size, h, strength = 12, 0.01, 1e3
@@ -441,7 +453,9 @@ def test_a_traced_number_in_a_closure_is_noticed(searched_by, transform, finder)
     assert set(searched_by) == {finder}
 
 
-@pytest.mark.parametrize(("h", "finders"), [(2e-3, 1), (0.02, 2)])
+@pytest.mark.parametrize(
+    ("h", "finders"), [pytest.param(2e-3, 1, marks=pytest.mark.slow), (0.02, 2)]
+)
 def test_derivatives_alone_do_not_need_newton_either(searched_by, h, finders):
     """Outside of `jit` it is known whether the run of a derivative has failed."""
     system, start, args = ej.problems.chain(8)

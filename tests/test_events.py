@@ -490,6 +490,7 @@ def test_a_start_with_a_closed_gap_is_a_failure():
         assert sol.result == ej.RESULTS.gap_closed_at_start
 
 
+@pytest.mark.slow
 def test_derivatives_of_impacts_at_once_are_those_of_each():
     # Two balls that do not know of each other hit the floor at the same time.
     balls = ej.System(jnp.eye(2), lambda q, args: 9.81 * jnp.sum(q))

@@ -16,7 +16,7 @@ from .references import double_pendulum_reference
 # unknowns, so the same motion to round-off. Index 3 locks, which amplifies round-off.
 SAME = [
     ("double", ej.EnergyPreserving()),
-    ("pendulum", ej.EnergyDecaying(0.5)),
+    pytest.param("pendulum", ej.EnergyDecaying(0.5), marks=pytest.mark.slow),
     ("pendulum", ej.EnergyConsistent(0.5)),
     pytest.param("pendulum", ej.KappaDecaying(0.5), marks=pytest.mark.slow),
     pytest.param("pendulum", ej.EnergyPreserving("index3"), marks=pytest.mark.slow),

@@ -197,7 +197,8 @@ def test_the_functions_of_the_user_are_traced_once():
         ej.simulate(system, ej.EnergyDecaying(alpha), start, dict(k=k), h=h, num_steps=10)
         return count
 
-    assert simulate(1.0, 0.1, 0.5, 1.0) > 5
+    # Once for its shape, for its value, for its slope and for a discrete gradient.
+    assert 1 <= simulate(1.0, 0.1, 0.5, 1.0) <= 4
     # What remains is the check of its shape, which runs no arithmetic.
     for numbers in ((2.0, 0.1, 0.5, 1.0), (1.0, 0.2, 0.5, 1.0), (1.0, 0.1, 0.7, 2.0)):
         assert simulate(*numbers) <= 1

@@ -51,6 +51,12 @@ def _compiled(
 
     @functools.wraps(fn)
     def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Value:
+        # Some transformations of JAX set the mesh of devices, also where there is none. It
+        # traces what it has traced under another mesh again.
+        with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
+            return choose(*args, **kwargs)
+
+    def choose(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Value:
         if not (at_top_level((args, kwargs)) and _are_known()):
             return within(*args, **kwargs)
         try:

@@ -18,7 +18,7 @@ from .._types import Count, Flag, Multipliers, Scalar
 from ..schemes import AbstractScheme, AbstractSchemeWithChord, Energies
 from .event_search import Found, no_search, settle, Watch
 from .halving import select
-from .reverse import keep_roots, loops
+from .reverse import keep_roots, loops, moving
 from .saving import Begin, Costs, Record, with_time
 from .step import advance, first_warm, model_for, StepOutput, Warm
 from .step_sizes import AbstractPlan, EqualPlan, Verdict
@@ -348,6 +348,8 @@ def run_loop(
         return after, _record_of(after, attempts, kept)
 
     begin = stepper.begin(start)
+    found = lambda x: (x.state, x.multipliers)
+    begin = eqx.tree_at(found, begin, moving(found(begin), (stepper, begin)))
     kept = Begin(
         kept=keep(stepper.model_at(begin))(begin.state, begin.place),
         multipliers=begin.multipliers,

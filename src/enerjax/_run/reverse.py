@@ -11,9 +11,11 @@ import math
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, PyTree
 
 from .._programs import in_any_lane, in_one_function
 from .._solvers import ROOT
@@ -37,6 +39,40 @@ _checkpoint = functools.partial(jax.checkpoint, prevent_cse=False)
 def keep_roots(fn: Body) -> Body:
     """`fn`, of which the reverse pass keeps the inputs and the roots."""
     return _checkpoint(fn, policy=jax.checkpoint_policies.save_only_these_names(ROOT))
+
+
+def moving(x: PyTree[Array], numbers: PyTree[Array]) -> PyTree[Array]:
+    """`x`, the start of a carry, with rates where one of the `numbers` has a rate.
+
+    The carry of a loop that depends on these numbers has rates after the first pass. Where
+    its start has none, JAX derives the whole loop before it finds out, and then once more.
+    """
+    inexact = [x for x in jax.tree.leaves(numbers) if eqx.is_inexact_array(x)]
+    return _moving(x, inexact)
+
+
+@jax.custom_jvp
+def _moving(x: PyTree[Array], numbers: list[Array]) -> PyTree[Array]:
+    del numbers
+    return x
+
+
+def _moving_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    x, _ = primals
+    is_zero = lambda rate: isinstance(rate, SymbolicZero)
+    moved = [rate for rate in tangents[1] if not is_zero(rate)]
+    # A zero that JAX does not take for one, because it is computed from a rate.
+    zero = jnp.sum(jnp.where(False, moved[0], 0)) if moved else 0
+    rates = jax.tree.map(
+        lambda x, rate: jnp.zeros_like(x) + zero if is_zero(rate) else rate,
+        x,
+        tangents[0],
+        is_leaf=is_zero,
+    )
+    return x, rates
+
+
+_moving.defjvp(_moving_jvp, symbolic_zeros=True)
 
 
 def loops(

@@ -15,7 +15,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from .._programs import in_one_function, is_known, part, simplified
+from .._programs import call_traced_once, in_one_function, is_known, part, simplified
 from .._types import Flag, Scalar
 from .linear.dense import AbstractFactors
 from .linear.jacobian import Linearisable
@@ -39,7 +39,9 @@ ROOT = "enerjax_root"
 
 @eqx.filter_custom_jvp
 def _root(fn, chord, root_finder, args, start, max_iterations):
-    return search(fn, chord, root_finder, args, start, max_iterations)
+    # A derivative of a loop over steps comes here several times.
+    numbers = args, start, max_iterations
+    return call_traced_once(search, fn, chord, root_finder, *numbers)
 
 
 @_root.def_jvp
