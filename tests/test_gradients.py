@@ -9,6 +9,7 @@ from jax.flatten_util import ravel_pytree
 import enerjax as ej
 from enerjax._programs.jaxprs import programs_within
 from enerjax._run import reverse as reverse_pass
+from enerjax._solvers import root
 
 from .helpers import long, problem, SCHEMES
 
@@ -301,3 +302,24 @@ def test_derivatives_where_the_stiffness_has_eigenvalues_of_both_signs():
         difference = (end(k + small * along) - end(k - small * along)) / (2 * small)
         # Truncation of the difference, 1e-8, and its round-off, 1e-12.
         assert gradient @ along == pytest.approx(float(difference), rel=1e-6)
+
+
+def test_a_derivative_traces_the_search_and_its_rule_once(monkeypatch):
+    """The state at the start does not depend on `h`, and the loop over steps changes that:
+    JAX would derive the loop twice, and trace the search in each of its programs."""
+    calls = []
+
+    def counted(name):
+        fn = getattr(root, name)
+        monkeypatch.setattr(root, name, lambda *args: calls.append(name) or fn(*args))
+
+    counted("search")
+    counted("with_jacobian")
+    system, start, args = ej.problems.double_pendulum()
+
+    def end(h):
+        run = ej.simulate(system, ej.EnergyPreserving(), start, args, h=h, num_steps=21)
+        return run.ys.q[-1, 0]
+
+    jax.jit(jax.grad(end)).trace(0.01)
+    assert sorted(calls) == ["search", "with_jacobian"]

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._programs import call_traced_once
 from .._solvers import inverse, solve_definite
 from .._types import Args, Coordinates, Scalar, Velocities
 from .base import (
@@ -75,23 +76,25 @@ class LagrangianSystem(AbstractCanonicalSystem):
         check_functions(self, required="potential")
 
     def kinetic_energy(self, state: State, args: Args = None) -> Scalar:
-        return self.kinetic(state.q, state.v, args)
+        return call_traced_once(self.kinetic, state.q, state.v, args)
 
     def potential_energy(self, state: State, args: Args = None) -> Scalar:
-        return self.potential(state.q, args)
+        return call_traced_once(self.potential, state.q, args)
 
     def energy(self, state: State, args: Args = None) -> Scalar:
         return self.kinetic_energy(state, args) + self.potential_energy(state, args)
 
     def inertia(self, state: State, args: Args) -> Float[Array, "nq nq"]:
         rest = jnp.zeros_like(state.q)
-        return jax.hessian(lambda qdot: self.kinetic(state.q, qdot, args))(rest)
+        return jax.hessian(lambda qdot: self.kinetic_energy(State(state.q, qdot), args))(
+            rest
+        )
 
     def hamiltonian_at(self, q, p, args):
         rate = self.velocity(q, p, args)
         energies = lambda q, rate, args: (
-            self.kinetic(q, rate, args),
-            self.potential(q, args),
+            self.kinetic_energy(State(q, rate), args),
+            self.potential_energy(State(q, rate), args),
         )
         args = _with_arrays(args)
         # The functions of the user may close over traced numbers.
@@ -108,7 +111,9 @@ class LagrangianSystem(AbstractCanonicalSystem):
         return jnp.diagonal(self.inertia(State(q, p), args))
 
     def momentum(self, state: State, args: Args) -> Coordinates:
-        return jax.grad(self.kinetic, argnums=1)(state.q, state.v, args)
+        return jax.grad(lambda qdot: self.kinetic_energy(State(state.q, qdot), args))(
+            state.v
+        )
 
     def velocity(self, q: Coordinates, p: Coordinates, args: Args) -> Velocities:
         return solve_definite(self.inertia(State(q, p), args), p)
@@ -179,25 +184,25 @@ class HamiltonianSystem(AbstractCanonicalSystem):
 
     def potential_energy(self, state: State, args: Args = None) -> Scalar:
         """`H(q, 0)`"""
-        return self.hamiltonian(state.q, jnp.zeros_like(state.v), args)
+        return call_traced_once(self.hamiltonian, state.q, jnp.zeros_like(state.v), args)
 
     def energy(self, state: State, args: Args = None) -> Scalar:
-        return self.hamiltonian(state.q, state.v, args)
+        return call_traced_once(self.hamiltonian, state.q, state.v, args)
 
     def inertia(self, state: State, args: Args) -> Float[Array, "nq nq"]:
         return inverse(self.inverse_inertia(state.q, state.v, args))
 
     def inverse_inertia(self, q, p, args):
-        return jax.hessian(self.hamiltonian, argnums=1)(q, p, args)
+        return jax.hessian(self.hamiltonian_at, argnums=1)(q, p, args)
 
     def masses(self, q, p, args):
         return 1 / jnp.diagonal(self.inverse_inertia(q, p, args))
 
     def hamiltonian_at(self, q, p, args):
-        return self.hamiltonian(q, p, args)
+        return call_traced_once(self.hamiltonian, q, p, args)
 
     def rate(self, q, p, args):
-        return jax.grad(self.hamiltonian, argnums=1)(q, p, args)
+        return jax.grad(self.hamiltonian_at, argnums=1)(q, p, args)
 
     def momentum(self, state: State, args: Args) -> Coordinates:
         return state.v

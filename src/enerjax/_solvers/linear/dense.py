@@ -212,6 +212,8 @@ def _solve_definite_jvp(primals, tangents):
     return x, _substituted(factors, d_right - d_matrix @ x)
 
 
+# Traced once for each size: both consist of many operations.
+@jax.jit
 def _root_free_cholesky(matrix: Array) -> tuple[list[Array], list[Array]]:
     """The pivots, and the columns below the diagonal of the factor, of `L D L^T`."""
     pivots, columns = [], []
@@ -223,6 +225,7 @@ def _root_free_cholesky(matrix: Array) -> tuple[list[Array], list[Array]]:
     return pivots, columns
 
 
+@jax.jit
 def _substituted(factors: tuple[list[Array], list[Array]], right: Array) -> Array:
     pivots, columns = factors
     scaled = []
