@@ -96,12 +96,15 @@ class Readable:
 
 
 def call_traced_once(fn: Callable[..., PyTree[Array]], *args: Any) -> PyTree[Array]:
-    """`fn(*args)`, as one operation whose program is traced once for all such calls.
+    """`fn(*args)`, in a program one operation, which is traced once for all such calls.
 
     To trace a function of the user takes longer than all else that a program does with it.
+    Outside of programs the function itself is called.
     """
     static, arrays = _parts((fn, args))
-    return _function_of_user(static, arrays) if is_hashable(static) else fn(*args)
+    if at_top_level(args) or not is_hashable(static):
+        return fn(*args)
+    return _function_of_user(static, arrays)
 
 
 @functools.partial(jax.jit, static_argnums=0)
