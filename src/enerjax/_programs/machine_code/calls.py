@@ -96,6 +96,7 @@ class Program:
     ):
         self.jaxpr, self.known = jaxpr, known
         self.is_part, self.linear = is_part, linear
+        self.is_evaluated = False
         # Evaluations outside of other programs share one compilation.
         self.compiled = jax.jit(lambda *numbers: list(self.bind(numbers)))
 
@@ -180,10 +181,16 @@ def _known_places(x: Any) -> np.ndarray | None:
 
 
 def _evaluated(*numbers: Array, program: Program) -> list[Array]:
-    # With `jax_disable_jit`, as in the search for NaNs, another `jit` would come back here.
-    if jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
+    # With `jax_disable_jit` another `jit` would come back here, and so does JAX itself, in
+    # its search for NaNs.
+    without_jit = jax.config.jax_disable_jit  # pyright: ignore[reportAttributeAccessIssue]
+    if without_jit or program.is_evaluated:
         return program(numbers)
-    return program.compiled(*numbers)
+    program.is_evaluated = True
+    try:
+        return program.compiled(*numbers)
+    finally:
+        program.is_evaluated = False
 
 
 def _shapes(*_: Any, program: Program) -> list[Any]:
