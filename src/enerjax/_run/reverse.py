@@ -92,9 +92,20 @@ def loops(
     return in_segments, _scan
 
 
+def scan(body: Body, carry: Any, inputs: Any, count: int) -> tuple[Any, Any]:
+    """`jax.lax.scan` with `count` passes, of which a single one is no loop.
+
+    The reverse pass of a loop gets index tables as numbers that the loop has computed, and
+    updates at computed places have no machine code where there are many.
+    """
+    if count > 1:
+        return jax.lax.scan(body, carry, inputs, length=count)
+    carry, out = body(carry, jax.tree.map(lambda x: x[0], inputs))
+    return carry, jax.tree.map(lambda x: jnp.asarray(x)[None], out)
+
+
 def _scan(body: Body, carry: Any, count: int, live: Flag) -> tuple[Any, Any]:
-    one_pass = lambda carry, _: body(carry, live)
-    return jax.lax.scan(one_pass, carry, None, length=count)
+    return scan(lambda carry, _: body(carry, live), carry, None, count)
 
 
 def _in_segments(

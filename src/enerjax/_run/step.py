@@ -17,6 +17,7 @@ from ..schemes import AbstractScheme, AbstractSchemeWithRotations, Energies
 from .halving import solve_or_divide
 from .inputs import check_halvings, prepare
 from .prediction import Memory
+from .reverse import scan
 from .stage import first_memory
 
 
@@ -128,7 +129,7 @@ def advance(
 
     lengths = jnp.asarray(scheme.stages, h.dtype)
     begin, inputs = (start, warm.rest), (lengths, warm.stages)
-    (state, rest), (lengths, reported, memory) = jax.lax.scan(stage, begin, inputs)
+    (state, rest), (lengths, reported, memory) = scan(stage, begin, inputs, lengths.size)
     multipliers, energies, details, costs, results = reported
     iterations, residuals, halvings, sizes = costs
     return StepOutput(

@@ -18,9 +18,9 @@ from ..._types import Count, Scalar
 Vector = Float[Array, " n"]
 Map = Callable[[Vector], Vector]
 
-# More directions are not kept. With an approximate inverse by which errors shrink to a
-# half, fifty reach round-off.
-_MOST = 64
+# Up to this number of unknowns all directions are kept: they suffice with any approximate
+# inverse. Of more unknowns few are kept, because each correction copies all of them.
+_SMALL, _FEW = 64, 16
 
 
 class _Search(NamedTuple):
@@ -41,7 +41,9 @@ class _Search(NamedTuple):
 
 # The most searches. Each begins with the true residual of the one before, from which the
 # residual that the iterations keep differs by round-off, and after a breakdown by more.
-_SEARCHES = 3
+# With few directions they go on from one another: with an approximate inverse by which
+# errors shrink to a half, fifty corrections reach round-off.
+_SEARCHES, _SEARCHES_BY_FEW = 3, 12
 
 
 def solve_by_products(product: Map, approximate: Map, right: Vector) -> Vector:
@@ -55,13 +57,14 @@ def solve_by_products(product: Map, approximate: Map, right: Vector) -> Vector:
     unit = jnp.where(largest > 0, largest, 1.0)
     right = right / unit
     size = _norm(right)
+    searches = _SEARCHES if right.size <= _SMALL else _SEARCHES_BY_FEW
 
     def refined(carry: tuple[Vector, Vector, Count]) -> tuple[Vector, Vector, Count]:
-        x, left, searches = carry
+        x, left, count = carry
         x = x + _found(product, approximate, left)
-        return x, right - product(x), searches + 1
+        return x, right - product(x), count + 1
 
-    goes_on = lambda carry: (_norm(carry[1]) > eps**0.875 * size) & (carry[2] < _SEARCHES)
+    goes_on = lambda carry: (_norm(carry[1]) > eps**0.875 * size) & (carry[2] < searches)
     first = jnp.zeros_like(right), right, jnp.array(0)
     x, left, _ = jax.lax.while_loop(goes_on, refined, first)
     return jnp.where(_norm(left) <= eps**0.75 * size, unit * x, jnp.nan)
@@ -73,7 +76,8 @@ def _norm(x: Vector) -> Scalar:
 
 def _found(product: Map, approximate: Map, right: Vector) -> Vector:
     """The solution that one search finds."""
-    most, eps = min(right.size, _MOST), jnp.finfo(right.dtype).eps
+    most = right.size if right.size <= _SMALL else _FEW
+    eps = jnp.finfo(right.dtype).eps
     put = jax.lax.dynamic_update_index_in_dim
     size = _norm(right)
 
