@@ -98,17 +98,17 @@ class Readable:
 def call_traced_once(fn: Callable[..., PyTree[Array]], *args: Any) -> PyTree[Array]:
     """`fn(*args)`, in a program one operation, which is traced once for all such calls.
 
-    To trace a function of the user takes longer than all else that a program does with it.
+    To trace a long function takes longer than all else that a program does with it.
     Outside of programs the function itself is called.
     """
     static, arrays = _parts((fn, args))
     if at_top_level(args) or not is_hashable(static):
         return fn(*args)
-    return _function_of_user(static, arrays)
+    return _traced_once(static, arrays)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _function_of_user(static: _Static, arrays: list[Array]) -> PyTree[Array]:
+def _traced_once(static: _Static, arrays: list[Array]) -> PyTree[Array]:
     fn, args = _joined(static, arrays)
     return fn(*args)
 

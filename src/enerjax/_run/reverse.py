@@ -28,7 +28,7 @@ LONG = 10_000
 Body: TypeAlias = Callable[[Any, Any], tuple[Any, Any]]
 
 
-# `scan(body, carry, count, live)` makes `count` passes from `(carry, live)`.
+# A loop: called with `(body, carry, count, live)` it makes `count` passes of `body`.
 Scan: TypeAlias = Callable[[Body, Any, int, Flag], tuple[Any, Any]]
 
 
