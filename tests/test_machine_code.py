@@ -396,6 +396,15 @@ def test_entries_at_known_places(places, operation):
     assert names & {"slice", "gather"} == {operation} - {"no operation"}
 
 
+def test_known_places_stay_known():
+    """JAX counts negative places from the end, which many updates must not compute."""
+    places = jnp.asarray(np.arange(150)[::-1])
+    fn = lambda x: jnp.zeros(150).at[places].add(x)
+    x = jnp.arange(150.0)
+    assert not why_not_one_function(fn, x)
+    np.testing.assert_array_equal(jax.jit(in_one_function(fn))(x), x[::-1])
+
+
 @pytest.mark.parametrize("rows", [8, 27])
 def test_inverses_are_renewed(rows):
     start = Inverse(jnp.eye(rows))

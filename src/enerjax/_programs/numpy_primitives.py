@@ -135,7 +135,7 @@ def _select(which, *cases, **_):
     return [np.choose(which.astype(int), cases)]
 
 
-FUNCTIONS: dict[str, Callable] = {
+_FUNCTIONS: dict[str, Callable] = {
     "abs": np.abs,
     "add": np.add,
     "and": np.bitwise_and,
@@ -155,6 +155,10 @@ FUNCTIONS: dict[str, Callable] = {
     "sqrt": np.sqrt,
     "sub": np.subtract,
 }
+
+
+# Functions of known numbers that need no call of JAX, which takes about a millisecond.
+BY_NUMPY = frozenset(("convert_element_type", "select_n", *_FUNCTIONS))
 
 
 def _converted(x: np.ndarray, dtype: Any) -> np.ndarray:
@@ -204,8 +208,8 @@ def evaluated(primitive: Any, values: list[Any], params: dict[str, Any]) -> list
         return _select(*map(np.asarray, values))
     if name == "convert_element_type":
         return [_converted(np.asarray(values[0]), params["new_dtype"])]
-    if name in FUNCTIONS:
-        return [np.asarray(FUNCTIONS[name](*map(np.asarray, values)))]
+    if name in _FUNCTIONS:
+        return [np.asarray(_FUNCTIONS[name](*map(np.asarray, values)))]
     if name in _REDUCTIONS and _is_plain(name, values[0]):
         out = _REDUCTIONS[name](values[0], axis=tuple(params["axes"]))
         return [np.asarray(out, values[0].dtype)]

@@ -72,7 +72,7 @@ def _root_jvp(primals, tangents):
         change = exact.solve(flat, -rate)
         change = change + _null_space_rate(exact, flat_fn, flat, (moved, fixed), t_args)
     elif chord is not None and has_chord_search(root_finder):
-        change = _change(exact, chord, root_finder, root, args, -rate)
+        change = _change(exact, chord, root_finder, root.value, args, -rate)
     else:
         change = exact.solve(flat, -rate)
     # Only the value of the root is differentiated. Its statistics have zero tangents.
@@ -89,25 +89,22 @@ def _change(
     exact: Linearisable,
     chord: Chord,
     root_finder: RootFinder | ChordAlone,
-    root: Root,
+    value: PyTree[Array],
     args: PyTree,
     right: Float[Array, " n"],
 ) -> Float[Array, " n"]:
     """The rate of change of a root that the chord method may have found.
 
-    Where it has, the approximate Jacobian is close to the exact one, and a few products
-    with the latter are cheaper than its entries.
+    Where the approximate Jacobian is close to the exact one, a few products with the latter
+    are cheaper than its entries.
     """
-    flat, unravel = ravel_pytree(root.value)
-    prepared = part(lambda: chord.prepare(root.value, args))()
+    flat, unravel = ravel_pytree(value)
+    prepared = part(lambda: chord.prepare(value, args))()
     correct = lambda x: ravel_pytree(chord.correct(unravel(x), args, prepared))[0]
-    by_products = solver_by_products(exact.value, flat, correct)
-    if isinstance(root_finder, ChordAlone) or flat.size <= _FEW:
-        return by_products(right)
-    # Lanes of a batch evaluate both. Without a right-hand side the products end at once.
-    by_chord = lambda right: by_products(jnp.where(root.by_chord, right, 0))
-    by_entries = lambda right: exact.solve(flat, right)
-    return jax.lax.cond(root.by_chord, by_chord, by_entries, right)
+    by_entries = None
+    if flat.size > _FEW and not isinstance(root_finder, ChordAlone):
+        by_entries = lambda right: exact.solve(flat, right)
+    return solver_by_products(exact.value, flat, correct, by_entries)(right)
 
 
 def _null_space_rate(

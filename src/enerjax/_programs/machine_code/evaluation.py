@@ -12,12 +12,7 @@ from jax.core import Tracer
 from jax.extend.core import Literal
 
 from ..jaxprs import programs_within, solution_program, wrapped_program
-from ..numpy_primitives import (
-    evaluated,
-    FUNCTIONS as FUNCTIONS_OF_NUMPY,
-    moved,
-    MOVES,
-)
+from ..numpy_primitives import BY_NUMPY, evaluated, moved, MOVES
 from ..primitives import FACTORS, LINEAR_SOLVE
 from .computed_places import dynamic_slice, dynamic_update_slice, gather, scatter
 from .contraction import contraction
@@ -121,7 +116,7 @@ class Evaluation:
         if name in LOOPS:
             return LOOPS[name](self, eqn, values)
         if all(isinstance(x, np.ndarray) for x in values):
-            is_slow = name in ELEMENTWISE and name not in FUNCTIONS_OF_NUMPY
+            is_slow = name in ELEMENTWISE and name not in BY_NUMPY
             if not (is_slow and eqn.outvars[0].aval.size <= MOST_CELLS):
                 return _known(eqn, values)
         if name in ELEMENTWISE:

@@ -1,7 +1,8 @@
 """Linear equations with a matrix that is known by its products, and nearly inverted.
 
-The method of generalised conjugate residuals (S. C. Eisenstat, H. C. Elman and M. H.
-Schultz, SIAM Journal on Numerical Analysis 20, 1983) with an approximate inverse.
+Corrections with the approximate inverse come first: each costs one product. Where they do
+not converge, the method of generalised conjugate residuals (S. C. Eisenstat, H. C. Elman
+and M. H. Schultz, SIAM Journal on Numerical Analysis 20, 1983) or another solver follows.
 """
 
 from collections.abc import Callable
@@ -11,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..._programs import part
-from ..._types import Count, Scalar
+from ..._programs import in_any_lane, part
+from ..._types import Count, Flag, Scalar
 
 
 Vector = Float[Array, " n"]
@@ -21,10 +22,31 @@ Map = Callable[[Vector], Vector]
 # Up to this number of unknowns all directions are kept: they suffice with any approximate
 # inverse. Of more unknowns few are kept, because each correction copies all of them.
 _SMALL, _FEW = 64, 16
+# Plain corrections end where two in a row leave more than the square of this fraction of
+# the residual. A single one may leave more: the residuals of two levels shrink in turn.
+_SHRINKS = 0.5
+# Corrections that shrink the residual that slowly reach round-off before this number.
+_MOST_CORRECTIONS = 64
+
+
+class _Corrections(NamedTuple):
+    """The state of plain corrections.
+
+    - `x`, `left`: the solution so far, and its residual.
+    - `size`, `last`, `before_last`: the size of this residual, and those of the two before.
+    - `used`: the number of corrections.
+    """
+
+    x: Vector
+    left: Vector
+    size: Scalar
+    last: Scalar
+    before_last: Scalar
+    used: Count
 
 
 class _Search(NamedTuple):
-    """The state of the iterations.
+    """The state of the conjugate residuals.
 
     - `x`, `left`: the solution so far, and its residual.
     - `directions`, `images`: those of the corrections so far, and their products with the
@@ -46,16 +68,57 @@ class _Search(NamedTuple):
 _SEARCHES, _SEARCHES_BY_FEW = 3, 12
 
 
-def solve_by_products(product: Map, approximate: Map, right: Vector) -> Vector:
+def solve_by_products(
+    product: Map, approximate: Map, right: Vector, otherwise: Map | None = None
+) -> Vector:
     """The solution `x` of `product(x) = right`, where `approximate` nearly inverts it.
 
-    It is NaN if its residual is not smaller than `right` by three quarters of the digits.
+    Where it does not, `otherwise` solves; by default the conjugate residuals. The solution
+    is NaN if its residual is not smaller than `right` by three quarters of the digits.
     """
+    if otherwise is None:
+        otherwise = lambda right: _by_conjugate_residuals(product, approximate, right)
     eps = jnp.finfo(right.dtype).eps
     # The squares of extreme numbers would overflow or vanish.
     largest = jnp.max(jnp.abs(right), initial=0.0)
     unit = jnp.where(largest > 0, largest, 1.0)
     right = right / unit
+    x, left = _corrected(product, approximate, right)
+    # NaN compares false: such a residual is left to the other solver.
+    is_found = left <= eps**0.75 * _norm(right)
+    # Without a right-hand side, lanes of a batch that are found end at once there.
+    rest = lambda: otherwise(jnp.where(is_found, 0, right))
+    other = jax.lax.cond(in_any_lane(~is_found), rest, lambda: jnp.zeros_like(right))
+    return unit * jnp.where(is_found, x, other)
+
+
+def _corrected(product: Map, approximate: Map, right: Vector) -> tuple[Vector, Scalar]:
+    """What plain corrections find, and the size of its residual."""
+    eps = jnp.finfo(right.dtype).eps
+    size = _norm(right)
+
+    def goes_on(carry: _Corrections) -> Flag:
+        shrinks = carry.size <= _SHRINKS**2 * carry.before_last
+        is_large = carry.size > eps**0.875 * size
+        return is_large & shrinks & (carry.used < _MOST_CORRECTIONS)
+
+    def correct(carry: _Corrections) -> _Corrections:
+        change = approximate(carry.left)
+        left = carry.left - product(change)
+        sizes = _norm(left), carry.size, carry.last
+        return _Corrections(carry.x + change, left, *sizes, carry.used + 1)
+
+    infinite = jnp.full_like(size, jnp.inf)
+    first = _Corrections(
+        jnp.zeros_like(right), right, size, infinite, infinite, jnp.array(0)
+    )
+    last = jax.lax.while_loop(goes_on, correct, first)
+    return last.x, last.size
+
+
+def _by_conjugate_residuals(product: Map, approximate: Map, right: Vector) -> Vector:
+    """Searches that follow one another, each from the true residual of the one before."""
+    eps = jnp.finfo(right.dtype).eps
     size = _norm(right)
     searches = _SEARCHES if right.size <= _SMALL else _SEARCHES_BY_FEW
 
@@ -67,7 +130,7 @@ def solve_by_products(product: Map, approximate: Map, right: Vector) -> Vector:
     goes_on = lambda carry: (_norm(carry[1]) > eps**0.875 * size) & (carry[2] < searches)
     first = jnp.zeros_like(right), right, jnp.array(0)
     x, left, _ = jax.lax.while_loop(goes_on, refined, first)
-    return jnp.where(_norm(left) <= eps**0.75 * size, unit * x, jnp.nan)
+    return jnp.where(_norm(left) <= eps**0.75 * size, x, jnp.nan)
 
 
 def _norm(x: Vector) -> Scalar:
@@ -115,20 +178,28 @@ def _found(product: Map, approximate: Map, right: Vector) -> Vector:
     return jax.lax.while_loop(goes_on, correct, first).x
 
 
-def solver_by_products(fn: Map, x: Vector, approximate: Map) -> Callable[[Vector], Vector]:
+def solver_by_products(
+    fn: Map, x: Vector, approximate: Map, otherwise: Map | None = None
+) -> Map:
     """A function that solves with the Jacobian of `fn` at `x`, and can be transposed.
 
-    `approximate` is linear and nearly inverts the Jacobian.
+    `approximate` is linear and nearly inverts the Jacobian, and `otherwise` solves where
+    it does not; see `solve_by_products`.
     """
 
     def solve(right: Vector) -> Vector:
         _, push = jax.linearize(fn, x)
-        return solve_by_products(push, approximate, right)
+        return solve_by_products(push, approximate, right, otherwise)
+
+    def transposed(linear: Map) -> Map:
+        _, pull = jax.vjp(linear, x)
+        return lambda y: pull(y)[0]
 
     def solve_transposed(right: Vector) -> Vector:
-        _, pull = jax.vjp(fn, x)
-        _, nearly = jax.vjp(approximate, right)
-        return solve_by_products(lambda y: pull(y)[0], lambda y: nearly(y)[0], right)
+        # The other solver is not linearised before it is needed.
+        other = otherwise
+        by = None if other is None else lambda y: transposed(other)(y)
+        return solve_by_products(transposed(fn), transposed(approximate), right, by)
 
     # The products that JAX passes to these have lost the known indices, without which the
     # iterations cannot be one function.
