@@ -20,14 +20,21 @@ PAGES = [HOME / "README.md", *sorted(DOCS.glob("*.md")), *API]
 NAVIGATION = re.findall(r"([\w/-]+\.md)$", (HOME / "mkdocs.yml").read_text(), re.MULTILINE)
 
 
+def is_missing(mark):
+    """Whether a block with the mark `needs NAME ...` needs a package that is missing."""
+    return not all(map(importlib.util.find_spec, mark.split()[1:]))
+
+
 def runs(mark):
-    """Whether a block with this mark is run. `no-run` marks what compiles for most of a
-    minute and is run by other tests, `needs NAME ...` what needs optional packages."""
-    return mark != "no-run" and all(map(importlib.util.find_spec, mark.split()[1:]))
+    """`no-run` marks what compiles for most of a minute and is run by other tests."""
+    return mark != "no-run" and not is_missing(mark)
 
 
 def with_code():
-    pages = [page for page in PAGES if any(runs(mark) for mark, _ in code_blocks(page))]
+    """Pages whose packages are all there; `.ci/extras` runs those that need others."""
+    marks = {page: [mark for mark, _ in code_blocks(page)] for page in PAGES}
+    missing = {page for page in PAGES if any(map(is_missing, marks[page]))}
+    pages = [page for page in PAGES if page not in missing and any(map(runs, marks[page]))]
     # Other tests run the scheme of one of these pages, and beams.
     others = ("beams.md", "write-your-own-scheme.md")
     return long(pages, *(x for x in pages if x.name in others))

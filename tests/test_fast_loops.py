@@ -47,6 +47,7 @@ def test_no_call_interrupts_the_loops_of_a_run(runs):
     assert int(fast[0]) == 0
 
 
+@pytest.mark.slow
 def test_the_motion_is_the_same(runs):
     slow, fast = (float(run.stdout.split()[1]) for run in runs)
     assert fast == pytest.approx(slow, abs=1e-11)  # round-off
