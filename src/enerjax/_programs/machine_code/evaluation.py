@@ -116,8 +116,9 @@ class Evaluation:
         if name in LOOPS:
             return LOOPS[name](self, eqn, values)
         if all(isinstance(x, np.ndarray) for x in values):
-            is_slow = name in ELEMENTWISE and name not in BY_NUMPY
-            if not (is_slow and eqn.outvars[0].aval.size <= MOST_CELLS):
+            # JAX would compile a program for each shape.
+            is_slow = name in _SLOW_BY_JAX and eqn.outvars[0].aval.size <= MOST_CELLS
+            if not is_slow:
                 return _known(eqn, values)
         if name in ELEMENTWISE:
             return [self._elementwise(eqn, values)]
@@ -510,6 +511,10 @@ def _known(eqn: Any, values: list[Any]) -> list[Value]:
     for aval in avals:
         type_name(aval.dtype)
     return [np.asarray(x, aval.dtype) for x, aval in zip(outs, avals, strict=True)]
+
+
+# What has a rule here, and would have to be compiled by JAX for known numbers.
+_SLOW_BY_JAX = {*ELEMENTWISE, "scatter-add"} - BY_NUMPY
 
 
 # Rules ------------------------------------------------------------------------------------
