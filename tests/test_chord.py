@@ -17,7 +17,7 @@ from enerjax._run import without_jacobian
 from enerjax._run.prediction import extrapolated
 from enerjax._solvers import Chord, find_root, Newton, schur, schur_tables
 from enerjax._solvers.linear.block_diagonal import in_blocks
-from enerjax._solvers.linear.krylov import solver_by_products
+from enerjax._solvers.linear.krylov import jacobian_solver
 
 from .helpers import EPS, long, SCHEMES
 
@@ -276,7 +276,7 @@ def test_the_derivatives_of_a_root_are_exact(strength, args):
 def test_a_chord_that_misleads_gives_no_wrong_derivative():
     """It ignores half of the unknowns, so its corrections do not reach the solution."""
     half = jnp.arange(SIZE) < SIZE // 2
-    solver = solver_by_products(lambda x: 2 * x, ARGS, lambda x: jnp.where(half, x, 0))
+    solver = jacobian_solver(lambda x: 2 * x, ARGS, lambda x: jnp.where(half, x, 0))
     assert jnp.all(jnp.isnan(solver(ARGS)))
     np.testing.assert_array_equal(solver(jnp.zeros(SIZE)), 0)
 
@@ -288,7 +288,7 @@ def test_a_breakdown_of_the_products_gives_no_wrong_derivative(size):
     matrix = rng.normal(size=(size, size))
     matrix = jnp.asarray(matrix - matrix.T)
     right = jnp.asarray(rng.normal(size=size))
-    solver = solver_by_products(lambda x: matrix @ x, right, lambda x: x)
+    solver = jacobian_solver(lambda x: matrix @ x, right, lambda x: x)
     assert jnp.all(jnp.isnan(solver(right)))
 
 
@@ -298,7 +298,7 @@ def test_products_solve_where_the_chord_is_far_off():
     for _ in range(10):
         matrix = jnp.asarray(np.eye(SIZE) + 0.3 * rng.normal(size=(SIZE, SIZE)))
         right = jnp.asarray(rng.normal(size=SIZE))
-        solver = solver_by_products(lambda x, m=matrix: m @ x, right, lambda x: x)
+        solver = jacobian_solver(lambda x, m=matrix: m @ x, right, lambda x: x)
         found, expected = solver(right), np.linalg.solve(matrix, right)
         rest = jnp.linalg.norm(matrix @ found - right)
         assert rest <= 1e-13 * jnp.linalg.norm(right)  # round-off

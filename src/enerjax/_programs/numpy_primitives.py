@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from .jaxprs import evaluate, interpret
@@ -164,9 +165,10 @@ BY_NUMPY = frozenset(("convert_element_type", "select_n", *_FUNCTIONS))
 def _converted(x: np.ndarray, dtype: Any) -> np.ndarray:
     """Numbers of another type; whole numbers that do not fit are the nearest that do."""
     dtype = np.dtype(dtype)
-    if x.dtype.kind != "f" or dtype.kind not in "iu":
+    if not (jnp.issubdtype(x.dtype, jnp.floating) and dtype.kind in "iu"):
         return x.astype(dtype)
-    info = np.iinfo(dtype)
+    # Half precision does not reach the ends of the range.
+    info, x = np.iinfo(dtype), x.astype(np.float64)
     whole = np.nan_to_num(np.clip(x, info.min, info.max), nan=0.0)
     inside = (whole > info.min) & (whole < info.max)
     ends = np.where(whole > 0, info.max, info.min).astype(dtype)

@@ -19,7 +19,7 @@ from .._programs import call_traced_once, in_one_function, is_known, part, simpl
 from .._types import Flag, Scalar
 from .linear.dense import AbstractFactors
 from .linear.jacobian import Linearisable
-from .linear.krylov import solver_by_products
+from .linear.krylov import jacobian_solver, SMALL
 from .newton import ChordAlone, Start
 from .root_finding import (
     Chord,
@@ -80,11 +80,6 @@ def _root_jvp(primals, tangents):
     return root, eqx.tree_at(lambda root: root.value, still, unravel(change))
 
 
-# Up to this number of unknowns there can be as many products as unknowns. They suffice
-# where the approximate Jacobian is far off too; if they ever do not, the rate is NaN.
-_FEW = 64
-
-
 def _change(
     exact: Linearisable,
     chord: Chord,
@@ -93,18 +88,18 @@ def _change(
     args: PyTree,
     right: Float[Array, " n"],
 ) -> Float[Array, " n"]:
-    """The rate of change of a root that the chord method may have found.
+    """The rate of change of a root of equations that have a chord method.
 
     Where the approximate Jacobian is close to the exact one, a few products with the latter
-    are cheaper than its entries.
+    are cheaper than its entries. Of few unknowns, products suffice in any case.
     """
     flat, unravel = ravel_pytree(value)
     prepared = part(lambda: chord.prepare(value, args))()
     correct = lambda x: ravel_pytree(chord.correct(unravel(x), args, prepared))[0]
     by_entries = None
-    if flat.size > _FEW and not isinstance(root_finder, ChordAlone):
+    if flat.size > SMALL and not isinstance(root_finder, ChordAlone):
         by_entries = lambda right: exact.solve(flat, right)
-    return solver_by_products(exact.value, flat, correct, by_entries)(right)
+    return jacobian_solver(exact.value, flat, correct, by_entries)(right)
 
 
 def _null_space_rate(

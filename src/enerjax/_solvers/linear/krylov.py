@@ -1,8 +1,9 @@
 """Linear equations with a matrix that is known by its products, and nearly inverted.
 
-Corrections with the approximate inverse come first: each costs one product. Where they do
-not converge, the method of generalised conjugate residuals (S. C. Eisenstat, H. C. Elman
-and M. H. Schultz, SIAM Journal on Numerical Analysis 20, 1983) or another solver follows.
+The preconditioned Richardson iteration, `x + P (b - A x)` with the approximate inverse `P`,
+comes first: a correction costs one product. Where it does not converge, another solver
+follows, or the method of generalised conjugate residuals (S. C. Eisenstat, H. C. Elman and
+M. H. Schultz, SIAM Journal on Numerical Analysis 20, 1983).
 """
 
 from collections.abc import Callable
@@ -19,18 +20,25 @@ from ..._types import Count, Flag, Scalar
 Vector = Float[Array, " n"]
 Map = Callable[[Vector], Vector]
 
-# Up to this number of unknowns all directions are kept: they suffice with any approximate
-# inverse. Of more unknowns few are kept, because each correction copies all of them.
-_SMALL, _FEW = 64, 16
-# Plain corrections end where two in a row leave more than the square of this fraction of
-# the residual. A single one may leave more: the residuals of two levels shrink in turn.
-_SHRINKS = 0.5
-# Corrections that shrink the residual that slowly reach round-off before this number.
+# Up to this number of unknowns the conjugate residuals keep all directions, which suffice
+# with any approximate inverse. If there are more unknowns they keep few directions, because
+# each correction copies all of them.
+SMALL, _FEW_DIRECTIONS = 64, 16
+# The most searches. Each begins with the true residual of the one before, from which the
+# residual that the iterations keep differs by round-off, and after a breakdown by more.
+# With few directions they go on from one another: with an approximate inverse by which
+# errors shrink to a half, fifty corrections reach round-off.
+_SEARCHES, _SEARCHES_BY_FEW = 3, 12
+# The Richardson iteration ends where two corrections together leave more than a quarter of
+# the residual. One correction may leave more than half: the residuals of the constraints at
+# position level and of those at velocity level shrink in turn.
+_SHRINKS = 0.25
+# At that rate 64 corrections reach round-off.
 _MOST_CORRECTIONS = 64
 
 
-class _Corrections(NamedTuple):
-    """The state of plain corrections.
+class _Richardson(NamedTuple):
+    """The state of the Richardson iteration.
 
     - `x`, `left`: the solution so far, and its residual.
     - `size`, `last`, `before_last`: the size of this residual, and those of the two before.
@@ -61,20 +69,14 @@ class _Search(NamedTuple):
     used: Count
 
 
-# The most searches. Each begins with the true residual of the one before, from which the
-# residual that the iterations keep differs by round-off, and after a breakdown by more.
-# With few directions they go on from one another: with an approximate inverse by which
-# errors shrink to a half, fifty corrections reach round-off.
-_SEARCHES, _SEARCHES_BY_FEW = 3, 12
-
-
 def solve_by_products(
     product: Map, approximate: Map, right: Vector, otherwise: Map | None = None
 ) -> Vector:
     """The solution `x` of `product(x) = right`, where `approximate` nearly inverts it.
 
-    Where it does not, `otherwise` solves; by default the conjugate residuals. The solution
-    is NaN if its residual is not smaller than `right` by three quarters of the digits.
+    Where it does not, `otherwise` solves; by default the conjugate residuals. These give
+    NaN if they do not reduce the residual by three quarters of the digits, which suffice
+    for the Richardson iteration.
     """
     if otherwise is None:
         otherwise = lambda right: _by_conjugate_residuals(product, approximate, right)
@@ -83,44 +85,44 @@ def solve_by_products(
     largest = jnp.max(jnp.abs(right), initial=0.0)
     unit = jnp.where(largest > 0, largest, 1.0)
     right = right / unit
-    x, left = _corrected(product, approximate, right)
+    last = _by_richardson(product, approximate, right)
     # NaN compares false: such a residual is left to the other solver.
-    is_found = left <= eps**0.75 * _norm(right)
-    # Without a right-hand side, lanes of a batch that are found end at once there.
+    is_found = last.size <= eps**0.75 * _norm(right)
+    # The conjugate residuals of lanes without a right-hand side end at once.
     rest = lambda: otherwise(jnp.where(is_found, 0, right))
     other = jax.lax.cond(in_any_lane(~is_found), rest, lambda: jnp.zeros_like(right))
-    return unit * jnp.where(is_found, x, other)
+    return unit * jnp.where(is_found, last.x, other)
 
 
-def _corrected(product: Map, approximate: Map, right: Vector) -> tuple[Vector, Scalar]:
-    """What plain corrections find, and the size of its residual."""
+def _by_richardson(product: Map, approximate: Map, right: Vector) -> _Richardson:
+    """The end of the Richardson iteration, whether it has converged or not."""
     eps = jnp.finfo(right.dtype).eps
     size = _norm(right)
 
-    def goes_on(carry: _Corrections) -> Flag:
-        shrinks = carry.size <= _SHRINKS**2 * carry.before_last
-        is_large = carry.size > eps**0.875 * size
-        return is_large & shrinks & (carry.used < _MOST_CORRECTIONS)
+    def goes_on(now: _Richardson) -> Flag:
+        shrinks = now.size <= _SHRINKS * now.before_last
+        # One more correction follows when the residual is small, for the entries of the
+        # solution that are far smaller than others.
+        was_large = now.last > eps**0.875 * size
+        return was_large & shrinks & (now.used < _MOST_CORRECTIONS)
 
-    def correct(carry: _Corrections) -> _Corrections:
-        change = approximate(carry.left)
-        left = carry.left - product(change)
-        sizes = _norm(left), carry.size, carry.last
-        return _Corrections(carry.x + change, left, *sizes, carry.used + 1)
+    def correct(now: _Richardson) -> _Richardson:
+        x = now.x + approximate(now.left)
+        left = right - product(x)
+        return _Richardson(x, left, _norm(left), now.size, now.last, now.used + 1)
 
     infinite = jnp.full_like(size, jnp.inf)
-    first = _Corrections(
+    first = _Richardson(
         jnp.zeros_like(right), right, size, infinite, infinite, jnp.array(0)
     )
-    last = jax.lax.while_loop(goes_on, correct, first)
-    return last.x, last.size
+    return jax.lax.while_loop(goes_on, correct, first)
 
 
 def _by_conjugate_residuals(product: Map, approximate: Map, right: Vector) -> Vector:
     """Searches that follow one another, each from the true residual of the one before."""
     eps = jnp.finfo(right.dtype).eps
     size = _norm(right)
-    searches = _SEARCHES if right.size <= _SMALL else _SEARCHES_BY_FEW
+    searches = _SEARCHES if right.size <= SMALL else _SEARCHES_BY_FEW
 
     def refined(carry: tuple[Vector, Vector, Count]) -> tuple[Vector, Vector, Count]:
         x, left, count = carry
@@ -139,7 +141,7 @@ def _norm(x: Vector) -> Scalar:
 
 def _found(product: Map, approximate: Map, right: Vector) -> Vector:
     """The solution that one search finds."""
-    most = right.size if right.size <= _SMALL else _FEW
+    most = right.size if right.size <= SMALL else _FEW_DIRECTIONS
     eps = jnp.finfo(right.dtype).eps
     put = jax.lax.dynamic_update_index_in_dim
     size = _norm(right)
@@ -178,7 +180,7 @@ def _found(product: Map, approximate: Map, right: Vector) -> Vector:
     return jax.lax.while_loop(goes_on, correct, first).x
 
 
-def solver_by_products(
+def jacobian_solver(
     fn: Map, x: Vector, approximate: Map, otherwise: Map | None = None
 ) -> Map:
     """A function that solves with the Jacobian of `fn` at `x`, and can be transposed.
@@ -191,13 +193,15 @@ def solver_by_products(
         _, push = jax.linearize(fn, x)
         return solve_by_products(push, approximate, right, otherwise)
 
-    def transposed(linear: Map) -> Map:
-        _, pull = jax.vjp(linear, x)
+    def transposed_derivative(of: Map) -> Map:
+        _, pull = jax.vjp(of, x)
         return lambda y: pull(y)[0]
 
     def solve_transposed(right: Vector) -> Vector:
-        # The other solver is not linearised before it is needed.
+        transposed = transposed_derivative
         other = otherwise
+        # Within the function: what the other solver needs, such as the entries of the
+        # Jacobian, is computed only where it is called.
         by = None if other is None else lambda y: transposed(other)(y)
         return solve_by_products(transposed(fn), transposed(approximate), right, by)
 
