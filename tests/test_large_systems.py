@@ -149,6 +149,25 @@ def test_the_inertia_of_many_bodies_is_kept_in_blocks():
     np.testing.assert_allclose(inverse_of(inertia) @ (full @ x), x, rtol=1e-10)
 
 
+def test_padded_blocks_couple_no_others():
+    """Also where the blocks are not known: smaller ones read no row of another block."""
+    energy = lambda v, m: (
+        m * (jnp.sum(jnp.sum(v[:90].reshape(-1, 3), axis=1) ** 2) + jnp.sum(v[90:] ** 2))
+    )
+    found = []
+
+    @jax.make_jaxpr
+    def product(m):
+        inertia = hessian(lambda v: energy(v, m), jnp.zeros(97))
+        found.append(jacobian_pattern(lambda x: inertia @ x, jnp.zeros(97)))
+        return inertia @ jnp.zeros(97)
+
+    product(2.0)
+    (pattern,) = found
+    assert pattern is not None
+    assert pattern.nnz == 30 * 9 + 7
+
+
 NUM_LINKS = 20
 
 

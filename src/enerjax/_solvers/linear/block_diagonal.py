@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from ..._programs import at_places, Indices, is_known, jacobian_pattern, with_any
+from ..._programs import at_places, Indices, is_known, jacobian_pattern
 from ..._types import Flag
 
 
@@ -24,8 +24,8 @@ class Places(Indices):
     """The rows of each block; the same for a matrix and its inverse.
 
     - `rows`: the rows of each block, shape `(blocks, size)`; the number of rows at padded
-      positions, where a block is smaller than the largest one. `read`: the same with any
-      row at padded positions, whose values are not used.
+      positions, where a block is smaller than the largest one. `read`: the same with the
+      first row of the block at padded positions, whose values are not used.
     - `padding`: ones on the diagonal at padded positions.
     - `back`: the position of each row in the blocks, and `within`: in its own block.
     """
@@ -38,7 +38,7 @@ class Places(Indices):
         within = np.arange(size) - starts[labels[order]]
         self.rows = np.full((sizes.size, sizes.max()), size)
         self.rows[labels[order], within] = order
-        self.read = with_any(self.rows, size)
+        self.read = np.where(self.rows == size, self.rows[:, :1], self.rows)
         self.padding = (self.rows == size)[:, :, None] * np.eye(sizes.max())
         self.back = np.zeros(size, int)
         self.back[order] = labels[order] * sizes.max() + within
