@@ -19,7 +19,7 @@ from .._programs import call_traced_once, in_one_function, is_known, part, simpl
 from .._types import Flag, Scalar
 from .linear.dense import AbstractFactors
 from .linear.jacobian import Linearisable
-from .linear.krylov import jacobian_solver, SMALL
+from .linear.krylov import FEW_UNKNOWNS, jacobian_solver
 from .newton import ChordAlone, Start
 from .root_finding import (
     Chord,
@@ -97,7 +97,7 @@ def _change(
     prepared = part(lambda: chord.prepare(value, args))()
     correct = lambda x: ravel_pytree(chord.correct(unravel(x), args, prepared))[0]
     by_entries = None
-    if flat.size > SMALL and not isinstance(root_finder, ChordAlone):
+    if flat.size > FEW_UNKNOWNS and not isinstance(root_finder, ChordAlone):
         by_entries = lambda right: exact.solve(flat, right)
     return jacobian_solver(exact.value, flat, correct, by_entries)(right)
 
