@@ -44,6 +44,10 @@ GRAPHS = {
     "chain": [(k - 1, k) for k in range(12)],
     "tree": [((k - 1) // 2, k) for k in range(1, 12)] + [(-1, 0)],
     "loops": [(k - 1, k) for k in range(9)] + [(8, -1), (2, 6)],
+    "apart": [(2 * k, 2 * k + 1) for k in range(5)],
+    "star": [(0, k) for k in range(1, 8)],
+    "net": [(i + 4 * j, i + 4 * j + 1) for i in range(3) for j in range(4)]
+    + [(i + 4 * j, i + 4 * j + 4) for i in range(4) for j in range(3)],
 }
 
 
@@ -68,17 +72,21 @@ def test_the_matrix_of_the_multipliers_is_that_of_dense_algebra(graph, coupled):
     symmetric = in_blocks(jnp.asarray(weight))
     tables = schur_tables(rows, at, symmetric)
     assert tables is not None
-    found = schur(tables, rows, at, symmetric)
-    jacobian = np.asarray(jax.jacfwd(rows)(at))
-    matrix = jacobian @ weight @ jacobian.T
     u, x = rng.normal(size=3 * count), rng.normal(size=(2, 2 * len(joints)))
-    np.testing.assert_allclose(found.product(u), jacobian @ u, atol=100 * EPS)
-    np.testing.assert_allclose(found.transposed(x[0]), jacobian.T @ x[0], atol=100 * EPS)
+
+    @jax.jit
+    def found(at, u, x):
+        of_rows = schur(tables, rows, at, symmetric)
+        products = of_rows.product(u), of_rows.transposed(x[0]), of_rows.solve(x)
+        return *products, jax.jacfwd(rows)(at)
+
+    product, transposed, solved, jacobian = found(at, *map(jnp.asarray, (u, x)))
+    matrix = jacobian @ weight @ jacobian.T
+    np.testing.assert_allclose(product, jacobian @ u, atol=100 * EPS)
+    np.testing.assert_allclose(transposed, jacobian.T @ x[0], atol=100 * EPS)
     # Round-off, by the condition of the matrix.
     atol = 10 * EPS * np.linalg.cond(matrix) * np.linalg.norm(np.linalg.inv(matrix), 2)
-    np.testing.assert_allclose(
-        found.solve(jnp.asarray(x)), np.linalg.solve(matrix, x.T).T, rtol=0, atol=atol
-    )
+    np.testing.assert_allclose(solved, np.linalg.solve(matrix, x.T).T, rtol=0, atol=atol)
 
 
 @pytest.mark.parametrize("copies", [1, 3])
@@ -96,9 +104,15 @@ def test_the_matrix_of_redundant_rows_is_that_of_the_pseudo_inverse(copies):
     added = jnp.asarray(eps * measure**2)
     tables = schur_tables(rows, at, weight)
     assert tables is not None
-    found = DelassusMatrix(weight, schur(tables, rows, at, weight, added), None, added)
     x = rng.normal(size=len(matrix))
-    solved = np.asarray(found.solve(jnp.asarray(x[None])))[0]
+
+    @jax.jit
+    def found(at, x):
+        of_rows = schur(tables, rows, at, weight, added)
+        delassus = DelassusMatrix(weight, of_rows, None, added)
+        return delassus.solve(x[None])[0], delassus.effective(x)
+
+    solved, effective = map(np.asarray, found(at, jnp.asarray(x)))
     # Truncation: of first order in what is added. Round-off is divided by its square.
     size = np.max(np.linalg.svd(np.linalg.pinv(matrix, rcond=1e-10))[1])
     null = np.linalg.svd(jacobian.T / measure)[2][4:]
@@ -106,7 +120,6 @@ def test_the_matrix_of_redundant_rows_is_that_of_the_pseudo_inverse(copies):
     np.testing.assert_allclose(matrix @ solved, in_range, atol=100 * eps * size)
     scale = np.linalg.norm(x)
     assert np.max(np.abs(null @ (measure * solved))) <= 1e3 * EPS / eps**2 * scale
-    effective = np.asarray(found.effective(jnp.asarray(x)))
     # Truncation, of second order, and round-off divided by what is added.
     atol = 1e3 * ((eps * size) ** 2 + EPS / eps) * scale
     np.testing.assert_allclose(jacobian.T @ effective, jacobian.T @ x, atol=atol)

@@ -8,14 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .values import Cells, dtype_of, type_name, Unsupported, Value
+from .values import Cells, dtype_of, MOST_CELLS, type_name, Unsupported, Value
 
 
 if TYPE_CHECKING:
     from .evaluation import Evaluation
 
-# The most products of numbers that are written out.
-_MOST_PRODUCTS = 2_000
+# The most products of two matrices that are written out. A loop over the rows has less
+# code, and reads its numbers in vectors.
+_MOST_PRODUCTS = 8_000
 
 
 def contraction(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
@@ -43,7 +44,9 @@ def contraction(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value
         x.n if isinstance(x, Cells) and x.lane is not None else 1 for x in (left, right)
     ]
     longest = max(max(shape), *lanes)
-    if size // longest > _MOST_PRODUCTS:
+    # More of them would be kept in memory, all at the same time.
+    is_matrix = not batch_left and free_left and free_right
+    if size // longest > MOST_CELLS or (is_matrix and size > _MOST_PRODUCTS):
         return [_large_product(self, eqn, values)]
     nb, nl, nr, nc = map(len, (batch_left, free_left, free_right, contracted_left))
     turn = lambda x, order: self.move(

@@ -29,28 +29,34 @@ def _lu(
     rows = jnp.arange(num_rows, dtype=jnp.int32)
     columns = jnp.arange(num_columns, dtype=jnp.int32)
 
-    def turn(carry: tuple[Array, Array], k: Count) -> tuple[tuple[Array, Array], Count]:
-        matrix, order = carry
-        sizes = jnp.where(rows >= k, jnp.abs(_column(matrix, k)), -1.0)
-        pivot = jnp.argmax(sizes).astype(jnp.int32)
-        exchanged = jnp.where(rows == pivot, k, rows)
-        exchanged = jnp.where(rows == k, pivot, exchanged)
-        matrix, order = (
-            x.at[exchanged].get(mode="promise_in_bounds") for x in (matrix, order)
+    def turn(
+        carry: tuple[Array, Array, Array], k: Count
+    ) -> tuple[tuple[Array, Array, Array], Count]:
+        # Rows stay where they are until the end. A row has a `place`, and the row at each
+        # place is in `order`.
+        matrix, place, order = carry
+        column = _column(matrix, k)
+        sizes = jnp.where(place >= k, jnp.abs(column), -1.0)
+        chosen = jnp.argmax(sizes).astype(jnp.int32)
+        pivot, first = (
+            jax.lax.dynamic_index_in_dim(x, i, keepdims=False)
+            for x, i in ((place, chosen), (order, k))
         )
-        row, column = _row(matrix, k), _column(matrix, k)
+        place = jnp.where(rows == chosen, k, jnp.where(rows == first, pivot, place))
+        order = jnp.where(rows == k, chosen, jnp.where(rows == pivot, first, order))
+        row = _row(matrix, chosen)
         divisor = row[k]
         # A column of zeros is left as it is, as by LAPACK.
         divisor = jnp.where(divisor == 0, 1, divisor)
-        factors = jnp.where(rows > k, column / divisor, 0)
+        factors = jnp.where(place > k, column / divisor, 0)
         rest = jnp.where(columns > k, row, 0)
         matrix = matrix - factors[:, None] * rest[None]
-        is_below = (rows > k)[:, None] & (columns == k)[None]
-        return (jnp.where(is_below, factors[:, None], matrix), order), pivot
+        is_below = (place > k)[:, None] & (columns == k)[None]
+        return (jnp.where(is_below, factors[:, None], matrix), place, order), pivot
 
     steps = jnp.arange(min(num_rows, num_columns), dtype=jnp.int32)
-    (matrix, order), pivots = jax.lax.scan(turn, (matrix, rows), steps)
-    return matrix, pivots, order
+    (matrix, _, order), pivots = jax.lax.scan(turn, (matrix, rows, rows), steps)
+    return matrix.at[order].get(mode="promise_in_bounds"), pivots, order
 
 
 def _cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:

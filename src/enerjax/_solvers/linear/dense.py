@@ -11,6 +11,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..._programs import in_one_function
@@ -22,7 +23,7 @@ from .norms import largest
 SMALL = 32
 # Rows up to which the loop over columns is unrolled. Longer unrolled loops compile slowly.
 _UNROLLED = 3
-# The same for `solve_definite`, which does not look for pivots.
+# The same for definite matrices, for which no pivots are looked for.
 _UNROLLED_IF_DEFINITE = 16
 
 
@@ -197,6 +198,23 @@ def solve_definite(
     if matrix.shape[0] > _UNROLLED_IF_DEFINITE:
         return solve(matrix, right)
     return _solve_definite(matrix, right)
+
+
+def definite_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """The inverse of a symmetric positive definite matrix, without pivoting."""
+    order = np.arange(matrix.shape[0])
+
+    def column(k: Any, matrix: Array) -> Array:
+        pivot = 1 / matrix[k, k]
+        own = order == k
+        row = jnp.where(own, pivot, matrix[k] * pivot)
+        factors = jnp.where(own, -1, matrix[:, k])
+        left = jnp.where(own[None] | own[:, None], 0, matrix)
+        return left - factors[:, None] * row[None]
+
+    if order.size > _UNROLLED_IF_DEFINITE:
+        return jax.lax.fori_loop(0, order.size, column, matrix)
+    return functools.reduce(lambda matrix, k: column(k, matrix), order, matrix)
 
 
 @jax.custom_jvp
