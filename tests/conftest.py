@@ -24,6 +24,15 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Marks as slow the variants of a test that `slow_for` names, by their parameters."""
+    for item in items:
+        names = item.get_closest_marker("slow_for")
+        if names is not None and item.callspec.id in names.args:
+            item.add_marker(pytest.mark.slow)
+
+
 @pytest.fixture(autouse=True, scope="session")
 def compile_quickly():
     """Also by LLVM, for the same reason."""

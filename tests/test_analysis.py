@@ -44,6 +44,7 @@ def _polygon(num_links, span):
     return np.cumsum(rods, axis=0)[:-1].ravel()
 
 
+@pytest.mark.slow
 def test_a_hanging_chain_rests_in_the_catenary_polygon():
     system, guess, args = _sagging(12, 0.6)
     found = ej.equilibrium(system, guess, args)
@@ -62,6 +63,7 @@ def test_a_hanging_chain_rests_in_the_catenary_polygon():
 
 
 @pytest.mark.parametrize("stiffness", [0.0, 1.0, 20.0])
+@pytest.mark.slow_for("1.0", "20.0")
 def test_a_horizontal_arm_comes_to_rest(stiffness):
     """Two links on torsion springs that are relaxed where they are horizontal: without
     springs, or on soft ones, Newton's method does not find the way from there."""

@@ -46,6 +46,7 @@ def test_pivots_are_the_largest_entries(size, sign):
 
 
 @pytest.mark.parametrize("size", [1, 2, 7, 20])
+@pytest.mark.slow_for("20")
 def test_definite_matrices_need_no_pivots(size):
     root = np.random.default_rng(0).normal(size=(size, size))
     matrix, right = jnp.asarray(root @ root.T + np.eye(size)), jnp.arange(1.0, 1 + size)
@@ -68,6 +69,7 @@ def test_a_singular_matrix_has_no_inverse():
 
 
 @pytest.mark.parametrize(("brake", "load"), [(1e10, 1e-6), (1e10, 1e-13), (1e8, 1e-8)])
+@pytest.mark.slow_for("10000000000.0-1e-06", "100000000.0-1e-08")
 def test_an_inverse_is_recomputed_when_an_equation_becomes_soft(brake, load):
     """A body whose brake is released: inverses of before do not see what is left of its
     equation, while the corrections of another body shrink as they should."""

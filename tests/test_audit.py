@@ -44,6 +44,9 @@ LONG = [("particles", "consistent", 0.0)]
     ("name", "scheme", "alpha"),
     [pytest.param(*x, marks=pytest.mark.slow if x in LONG else []) for x in CASES],
 )
+@pytest.mark.slow_for(
+    "particles-consistent-0.5", "body-preserving-0.0", "particles-preserving-0.0"
+)
 def test_the_energy_identity_holds(name, scheme, alpha):
     solution = solve(name, scheme, alpha, h=STEP[name], steps=200)
     assert not failed(solution)

@@ -42,6 +42,7 @@ def test_bad_shapes_raise_an_error_under_jit_too():
         jax.jit(lambda h: simulate(constraint=lambda q, args: q @ q - 1, h=h))(0.01)
 
 
+@pytest.mark.slow
 def test_numbers_that_vary_over_devices_are_refused():
     by_device = jax.sharding.PartitionSpec("lanes")
     mesh = jax.make_mesh((1,), ("lanes",), axis_types=(jax.sharding.AxisType.Auto,))

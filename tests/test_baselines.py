@@ -71,6 +71,7 @@ def test_generalized_alpha_is_the_published_method():
 @pytest.mark.parametrize(
     ("scheme", "tip", "largest"), [("rattle", 8.8e-5, 4.5e-4), ("alpha", None, 9.1e-4)]
 )
+@pytest.mark.slow_for("rattle-8.8e-05-0.00045")
 def test_the_double_pendulum_from_the_horizontal(scheme, tip, largest):
     """Figures of other programs: RATTLE in C, and EXUDYN with rho 0.9."""
     system, start, args = ej.problems.chain(2, length=2.0, mass=2.0)
@@ -84,6 +85,7 @@ def test_the_double_pendulum_from_the_horizontal(scheme, tip, largest):
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.slow_for("alpha ggl")
 def test_order_on_the_double_pendulum(scheme):
     system, start, args = problem("double")
     exact, method = double_pendulum_reference(2.0), SCHEMES[scheme]

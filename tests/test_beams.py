@@ -236,6 +236,7 @@ def spaghetti():
     return beam, scene, sol
 
 
+@pytest.mark.slow
 def test_a_flying_beam_keeps_its_balances(spaghetti):
     _, scene, sol = spaghetti
     size = float(jnp.abs(sol.audit.energy).max())
@@ -441,6 +442,7 @@ def test_a_motion_has_gradients_by_stiffness_load_and_mass():
 # Modes ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_axial_vibrations_of_a_clamped_beam():
     """The error is that of the elements, `(k l)^2 / 24` for the wave number `k`."""
     section = ej.Section(EA=80.0, GA=30.0, EI=4.0, rhoA=2.0, rhoI=0.1)

@@ -12,6 +12,7 @@ grad = ej.discrete_grad
 
 
 @pytest.mark.parametrize("power", [1.5, 2.5, 2.2, 3.0])
+@pytest.mark.slow_for("2.2")
 def test_powers_from_zero_and_across_it(power):
     ramp = lambda x: jnp.maximum(x, 0.0) ** power
     assert grad(ramp)(-1.0, -0.5) == 0

@@ -165,6 +165,9 @@ def _left_by_one_correction(scheme, system, start, rng):
 
 @pytest.mark.parametrize("name", CHORDS)
 @pytest.mark.parametrize("size", [4, pytest.param(80, marks=pytest.mark.slow)])
+@pytest.mark.slow_for(
+    "4-consistent", "4-momentum", "4-decaying 0", "4-preserving index3", "4-consistent 0"
+)
 def test_without_stiffness_one_correction_solves_the_step(name, size):
     """With a weight for a potential and constant gradients of the constraints."""
     rng = np.random.default_rng(0)
@@ -199,6 +202,7 @@ AND_JOINTS = [
 @pytest.mark.parametrize(
     ("name", "joined"), [*((x, False) for x in WITH_MOMENTA), *AND_JOINTS]
 )
+@pytest.mark.slow_for("preserving-True", "consistent 0-False")
 def test_with_momenta_one_correction_solves_the_step_too(name, joined):
     """With a constant inertia, declared as if it varied."""
     rng = np.random.default_rng(0)
@@ -222,6 +226,7 @@ REDUNDANT = [x for x in CHORDS if "consistent" not in x and x != "momentum"]
     "name",
     long(REDUNDANT, *(x for x in REDUNDANT if x not in ("preserving", "decaying 0"))),
 )
+@pytest.mark.slow_for("preserving")
 def test_redundant_coordinates_take_one_correction_too(name):
     """With a constant map to the velocities, and constant relations of the coordinates."""
     rng = np.random.default_rng(1)
@@ -411,6 +416,7 @@ def test_a_run_that_needs_newton_is_made_again_with_it_once(searched_by):
     np.testing.assert_allclose(sol.ys.q, both.ys.q, rtol=0, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_residuals_of_two_levels_may_shrink_in_turn(searched_by):
     """In a slider-crank a correction can leave most of a residual, the next one little."""
     system, start, args = ej.problems.slider_crank()
@@ -469,6 +475,7 @@ def test_a_traced_number_in_a_closure_is_noticed(searched_by, transform, finder)
 @pytest.mark.parametrize(
     ("h", "finders"), [pytest.param(2e-3, 1, marks=pytest.mark.slow), (0.02, 2)]
 )
+@pytest.mark.slow
 def test_derivatives_alone_do_not_need_newton_either(searched_by, h, finders):
     """Outside of `jit` it is known whether the run of a derivative has failed."""
     system, start, args = ej.problems.chain(8)

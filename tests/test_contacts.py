@@ -71,6 +71,7 @@ def test_elastic_hits_of_a_sphere_in_a_bowl_keep_the_energy():
     assert np.abs(centre[:, 1]).max() < 1e-14
 
 
+@pytest.mark.slow
 def test_a_penalty_has_an_exact_balance_and_approaches_the_impact():
     law = contacts.Penalty(1e5, exponent=1.5, damping=0.2)
     scene, sol = run(bar(law), GRAVITY, h=1e-3, num_steps=900)

@@ -145,6 +145,7 @@ def test_it_is_linear_in_the_function(form, increment):
 
 
 @form_names
+@pytest.mark.slow_for("mean value, 3 points")
 def test_derivatives_at_equal_points_are_those_of_the_limit(form):
     a, _ = points(9, 0.0)
     # D(a, b) = grad fn(a) + Hess fn(a) (b - a) / 2 + ...

@@ -41,6 +41,9 @@ def with_code():
 
 
 @pytest.mark.parametrize("page", with_code(), ids=lambda page: page.name)
+@pytest.mark.slow_for(
+    "events.md", "pictures.md", "rolling.md", "identification.md", "schemes.md"
+)
 def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
     """A page is read from top to bottom: later blocks use names of earlier ones."""
     monkeypatch.chdir(tmp_path)

@@ -42,6 +42,7 @@ def driven_reference():
 @pytest.mark.parametrize(
     "scheme", long(SCHEMES, "preserving gonzalez", "consistent damped")
 )
+@pytest.mark.slow_for("decaying", "consistent")
 def test_a_pendulum_on_a_moving_pivot(scheme):
     method, order = SCHEMES[scheme]
     start = driven_start()

@@ -73,6 +73,13 @@ def long(cases):
 
 
 @pytest.mark.parametrize(("name", "scheme"), long(PRESERVING))
+@pytest.mark.slow_for(
+    "stiff-decaying",
+    "double-consistent",
+    "pendulum-kappa",
+    "angle-preserving",
+    "double-preserving",
+)
 def test_at_alpha_zero_the_energy_is_constant(name, scheme):
     solution = run(name, scheme)
     assert not failed(solution)

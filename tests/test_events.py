@@ -242,6 +242,7 @@ def test_a_terminal_event_ends_the_run():
     assert np.all(np.isnan(sol.ys.q[~reached]))
 
 
+@pytest.mark.slow
 def test_a_direction_selects_zeros():
     swings = [swinging_freely(direction).events.count for direction in (-1, 0, 1)]
     assert [int(n) for n in swings] == [2, 4, 2]

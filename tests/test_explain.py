@@ -42,6 +42,7 @@ def test_lagrangians_are_one_function_too():
     assert found.obstacles == ()
 
 
+@pytest.mark.slow
 def test_factors_of_small_matrices_and_running_sums_are_no_obstacles():
     def kinetic(q, qdot, args):
         rates = jnp.cumsum(qdot)

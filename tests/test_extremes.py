@@ -26,6 +26,7 @@ def steps():
     return list(numbers.step_rows(quick=True))
 
 
+@pytest.mark.slow
 def test_a_linear_spring_is_right_at_every_step():
     rows = [row for row in steps() if row.case != "quartic spring"]
     assert len(rows) > 30
@@ -38,6 +39,7 @@ def test_a_stiff_quartic_spring_is_right_or_reports_a_failure():
     assert {row.verdict for row in rows if row.x <= 1} == {RIGHT, LAW}
 
 
+@pytest.mark.slow
 def test_motion_that_dies_out_away_from_zero_stays_at_rest():
     """Where terms cancel, what is left of the forces is round-off, not motion."""
     _, found = verdicts(numbers.settling_rows(quick=True))

@@ -28,6 +28,7 @@ def run(name, scheme, alpha, h):
 
 
 @pytest.mark.parametrize(("name", "scheme", "alpha", "h"), FAILING)
+@pytest.mark.slow_for("stiff-decaying index3-0.0-0.01")
 def test_a_failure_is_reported_at_the_step_where_it_happens(name, scheme, alpha, h):
     solution = run(name, scheme, alpha, h)
     assert failed(solution)
@@ -58,6 +59,7 @@ def test_a_failure_is_reported_at_the_step_where_it_happens(name, scheme, alpha,
 @pytest.mark.parametrize(
     ("name", "scheme", "alpha", "h"), [FAILING[0], FAILING[4]], ids=["index3", "kappa"]
 )
+@pytest.mark.slow_for("kappa")
 def test_rows_before_a_failure_are_those_of_a_shorter_run(name, scheme, alpha, h):
     solution = run(name, scheme, alpha, h)
     done = int(solution.stats.completed_steps)

@@ -60,6 +60,7 @@ def test_too_late_is_an_error():
     assert "came too late" in run.stderr
 
 
+@pytest.mark.slow
 def test_twice_is_not_too_late():
     run = _in_a_process("import enerjax as ej\nej.enable_fast_loops()\n" * 2)
     assert run.returncode == 0, run.stderr

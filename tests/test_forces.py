@@ -139,6 +139,7 @@ BRAKED = [
 
 
 @pytest.mark.parametrize(("scheme", "smooth"), BRAKED)
+@pytest.mark.slow_for("EnergyPreserving-False", "EnergyConsistent-False")
 def test_the_energy_that_dampers_remove_is_reported_separately(scheme, smooth):
     system = ej.System(DAMPED.kinetic, DAMPED.potential, force=_pushed_and_braked)
     args = dict(k=4.0, c=0.8, dry=0.1, push=0.7, smooth=smooth)
@@ -190,6 +191,7 @@ PENDULUM_ARGS = dict(m=1.5, g=9.81, l=1.0, c=0.4)
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.slow_for("kappa", "consistent")
 def test_a_damped_pendulum_on_its_rod(scheme):
     rates = lambda _, y: [y[1], -9.81 * np.sin(y[0]) - 0.4 / 1.5 * y[1]]
     angle = exact(rates, [np.pi / 2, 0.0], 0.0, 2.0)[0]
@@ -243,6 +245,7 @@ def body_reference(t0, t1):
 
 
 @pytest.mark.parametrize("scheme", long(["preserving", "decaying", "kappa"], "kappa"))
+@pytest.mark.slow_for("decaying")
 def test_a_torque_acts_in_body_axes(scheme):
     start = ej.State([1.0, 0, 0, 0], [1.0, 2.0, 2.0])
     truth = body_reference(0.3, 1.3)

@@ -24,6 +24,7 @@ SAME = [
 
 
 @pytest.mark.parametrize(("name", "scheme"), SAME)
+@pytest.mark.slow_for("pendulum-scheme2")
 def test_constant_inertia_gives_the_motion_of_a_system(name, scheme):
     problems = {"double": ej.problems.double_pendulum, "pendulum": ej.problems.pendulum}
     system, start, args = problems[name]()
@@ -51,6 +52,7 @@ ORDERS = [
 
 
 @pytest.mark.parametrize(("scheme", "order"), ORDERS)
+@pytest.mark.slow_for("consistent-4")
 def test_angles_move_as_points_on_rods(scheme, order):
     reference = double_pendulum_reference(1.0)
     steps = (40, 80) if order == 6 else (100, 200)
@@ -120,6 +122,7 @@ def test_lanes_of_a_sweep_are_their_single_runs():
     np.testing.assert_allclose(lanes, alone, rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_hamiltonian_by_numbers_of_python():
     system = ej.System.from_lagrangian(
         lambda q, v, args: 0.5 * args["m"] * (2 + jnp.cos(q[0] - q[1])) * v @ v,

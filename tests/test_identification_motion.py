@@ -155,6 +155,7 @@ def swing(parameters, start, t):
     return x * c + v / w * s, v * c - w * x * s
 
 
+@pytest.mark.slow
 def test_windows_find_what_one_run_finds():
     times = np.linspace(0.0, 8.0, 65)
     data = 0.7 * np.sin(2.0 * times + 0.3)

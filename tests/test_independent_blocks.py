@@ -59,6 +59,7 @@ def test_products_are_those_of_the_whole_matrix():
     np.testing.assert_allclose(product, MATRIX @ RIGHT, rtol=0, atol=4e-15)
 
 
+@pytest.mark.slow
 def test_derivatives_of_solutions():
     change = np.where(MATRIX == 0, 0, RNG.normal(size=(8, 8)))
     change = np.where(MATRIX == 1, 0, change)
@@ -96,6 +97,7 @@ def test_zeros_at_one_point_only_are_not_constant():
 
 
 @pytest.mark.parametrize("jit", [False, True])
+@pytest.mark.slow_for("True")
 def test_a_body_in_euler_parameters_has_blocks_for_position_and_rotation(jit):
     """The three entries of the place of the top are themselves."""
     system, start, args = problems.heavy_top()

@@ -39,6 +39,7 @@ def test_an_inerter_shares_a_force_among_two_masses():
 
 
 @pytest.mark.parametrize("in_space", long([False, True], False))
+@pytest.mark.slow_for("True")
 def test_a_rotor_shares_a_torque_among_two_bodies(in_space):
     """As above, for two wheels on one axle; and a derivative with respect to the rotor."""
     j1, j2, b, torque, axis = 2.0, 3.0, 1.5, 4.0, [0.0, 0.0, 1.0]

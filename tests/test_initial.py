@@ -258,6 +258,7 @@ def test_a_lane_without_a_start_does_not_affect_the_others():
 
 
 @pytest.mark.parametrize(("angle", "tolerance"), [(1e-2, 4 * EPS), (1e-3, 1e-11)])
+@pytest.mark.slow_for("0.001-1e-11")
 def test_known_velocities_are_kept_in_a_nearly_singular_pose(angle, tolerance):
     """A pendulum near the horizontal, of which the small velocity along the rod is known.
 

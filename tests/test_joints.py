@@ -67,6 +67,7 @@ def on_ground(name):
 
 
 @pytest.mark.parametrize("name", JOINTS)
+@pytest.mark.slow_for("spherical")
 def test_a_joint_leaves_its_degrees_of_freedom_and_carries_all_other_loads(name):
     scene, motions = on_ground(name), JOINTS[name][1]
     system, q, args = scene.system, scene.q, scene.args
@@ -97,6 +98,7 @@ def test_a_joint_leaves_its_degrees_of_freedom_and_carries_all_other_loads(name)
     np.testing.assert_allclose(found.torque, 0, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_clamp_carries_the_weight_and_its_moment_about_the_clamp():
     parts = [
         ej.bodies.PlanarBody.rod("arm", 2.0, [1.0, 0.0], [1.6, 0.0]),

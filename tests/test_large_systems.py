@@ -73,6 +73,7 @@ def test_the_pattern_covers_the_jacobian(name):
         np.testing.assert_array_equal(jacobian, pattern)
 
 
+@pytest.mark.slow
 def test_a_pattern_that_is_too_dense_is_none(monkeypatch):
     """A system of such functions runs all the same, densely."""
     monkeypatch.setattr("enerjax._programs.sparsity.pattern._MAX_ENTRIES", 1000)
@@ -106,6 +107,7 @@ def _banded(size, rng):
 
 
 @pytest.mark.parametrize("size", [30, 101, 300])
+@pytest.mark.slow_for("300")
 def test_a_shuffled_band_is_found_and_solved(size):
     rng = np.random.default_rng(size)
     matrix, right = _banded(size, rng), rng.normal(size=size)
@@ -264,6 +266,7 @@ def test_a_chain_that_cracks_like_a_whip_keeps_energy_and_constraints(num_links)
 
 
 @pytest.mark.parametrize("diagonal", [True, False])
+@pytest.mark.slow_for("False")
 def test_a_band_is_cut_into_the_blocks_that_it_is_made_of(diagonal):
     """Blocks as wide as the band would be of seven unknowns; rows must be exchanged where
     the diagonal is small."""

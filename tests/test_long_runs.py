@@ -84,6 +84,7 @@ def test_a_run_in_pieces_is_that_in_one_piece():
     assert np.abs(difference).max() <= 2
 
 
+@pytest.mark.slow
 def test_a_killed_run_is_continued(tmp_path):
     file = tmp_path / "run.npz"
     command = [sys.executable, "-m", "tests.long_process", str(file)]
@@ -211,6 +212,7 @@ def controlled_whole():
     return controlled()
 
 
+@pytest.mark.slow
 def test_a_controller_goes_on_with_its_memory():
     expected = controlled_whole()
     assert expected.result == ej.RESULTS.successful

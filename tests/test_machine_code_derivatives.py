@@ -163,6 +163,7 @@ def test_inputs_that_become_constants_are_passed_as_inputs():
 @pytest.mark.parametrize(
     "name", long(["four_bar", "car_axis", "heavy_top"], "car_axis", "heavy_top")
 )
+@pytest.mark.slow_for("four_bar")
 def test_runs_and_their_derivatives_are_one_function(name):
     system, start, args = getattr(ej.problems, name)()
     run = lambda args: ej.simulate(

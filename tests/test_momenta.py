@@ -88,6 +88,7 @@ def _check_points(name, steps, bound):
 
 
 @pytest.mark.parametrize("name", FREE)
+@pytest.mark.slow_for("ring")
 def test_points_keep_their_momenta(name):
     _check_points(name, 1000, 1e-12)  # round-off of a thousand steps
 
@@ -125,6 +126,7 @@ def _top(name, h, steps=200, save_every=1):
 
 
 @pytest.mark.parametrize("name", long(TOPS, "top", "top canonical"))
+@pytest.mark.slow_for("top directors")
 def test_tops_conserve_energy_and_the_visible_momenta(name):
     run, vertical, spin = _top(name, 1e-3)
     # The same program, for twice as long.

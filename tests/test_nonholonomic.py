@@ -78,6 +78,7 @@ def sleigh():
     ],
     ids=["preserving", "composed", "decaying", "rattle"],
 )
+@pytest.mark.slow_for("decaying")
 def test_the_sleigh_converges_to_its_closed_form(scheme, order, bound):
     errors = [error_of(sleigh_run(scheme, 3 / n, n)) for n in (30, 60)]
     # Truncation.

@@ -78,6 +78,17 @@ CASES = [
 
 
 @pytest.mark.parametrize(("name", "scheme", "alpha", "order", "deviation", "steps"), CASES)
+@pytest.mark.slow_for(
+    "double-preserving-0.0-2-0.1-steps2",
+    "pendulum-kappa-0.0-2-0.1-steps12",
+    "pendulum-kappa-0.5-2-0.1-steps13",
+    "pendulum-kappa-1.0-2-0.1-steps14",
+    "spring-consistent-0.5-3-0.15-steps18",
+    "spring-consistent-0.0-4-0.15-steps17",
+    "spring-consistent-1.0-3-0.15-steps19",
+    "pendulum-preserving-0.0-2-0.1-steps0",
+    "pendulum-composed 4-0.0-4-0.2-steps24",
+)
 def test_errors_shrink_with_the_order_of_the_scheme(
     name, scheme, alpha, order, deviation, steps
 ):
@@ -181,6 +192,7 @@ def test_the_dissipative_stiffness_is_that_of_half_a_step_of_free_flight():
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_zero_as_a_python_number_leaves_the_dissipation_out():
     """The same motion as with an array, which can be differentiated; a number cannot."""
     system, start, args = ej.problems.double_pendulum()

@@ -14,6 +14,7 @@ W, STEPS = 3.0, 200
     [ej.EnergyPreserving(), ej.EnergyConsistent(0.0), ej.EnergyConsistent(0.5)],
     ids=["preserving", "consistent", "consistent decaying"],
 )
+@pytest.mark.slow_for("preserving", "consistent decaying")
 def test_the_estimate_follows_the_error_of_an_oscillator(scheme):
     system = ej.System(lambda v, args: 0.5 * v @ v, lambda q, args: 0.5 * W**2 * q @ q)
     for h in (0.01, 0.05, 0.2):
@@ -32,6 +33,7 @@ def test_the_estimate_follows_the_error_of_an_oscillator(scheme):
     assert "phase of the motion, by local errors: to about" in str(unresolved)
 
 
+@pytest.mark.slow
 def test_an_unresolved_motion_has_a_large_phase_error():
     """A light mass that is whipped around, faster than the steps can follow: the balance
     holds, and the heavy mass is 0.98 of a length off."""

@@ -148,6 +148,7 @@ def test_without_times_the_last_row_is_drawn_and_without_a_run_the_start():
         np.testing.assert_allclose(corners.mean(axis=0), thrown_pose(t)[0], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_joints_springs_and_traces_are_where_the_bodies_are():
     scene, sol = hung()
     ax = scene.draw(sol, traces=[("rod", [0.5, 0.0])])

@@ -333,6 +333,7 @@ def free_body():
 
 
 @pytest.mark.parametrize("spin", [0.1, 3.0, 7.0, 60.0])
+@pytest.mark.slow_for("0.1", "7.0")
 def test_a_body_that_turns_freely_is_late_by_the_formula_of_cayley(spin):
     # In the last cases it turns by more than half a turn, and by ten turns, in one step:
     # energy and momenta are still right, and the step turns it by less than half a turn.

@@ -165,6 +165,7 @@ PROGRAMS = dict(
 
 @settings(max_examples=3, deadline=None, derandomize=True, database=None)
 @given(**PROGRAMS)
+@pytest.mark.slow
 def test_the_identity_holds_on_random_programs(steps, point):
     _check(steps, point)
 

@@ -331,6 +331,7 @@ def test_a_repeated_hinge_is_the_one_that_is_redundant():
     assert found.degrees_of_freedom == 1
 
 
+@pytest.mark.slow
 def test_modes_of_an_over_constrained_scene():
     """The beam hangs from three bars, and swings as one point does."""
     system, start, args = beam_of_parts(-np.pi / 2).build()

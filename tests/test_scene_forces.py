@@ -78,6 +78,7 @@ def damped_pendulum(damping):
         pytest.param(ej.EnergyConsistent(0.5), marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.slow_for("scheme0")
 def test_a_turning_damper_removes_energy_in_every_step(scheme):
     system, start, args = damped_pendulum(1.0).build()
 

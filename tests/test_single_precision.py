@@ -35,6 +35,7 @@ def run(name, dtype):
 @pytest.mark.parametrize(
     "name", long(RUNS, "preserving", "decaying", "composed", "top", "chain")
 )
+@pytest.mark.slow_for("consistent")
 def test_energy_and_constraints_hold_to_the_round_off_of_the_dtype(name):
     single, double = run(name, jnp.float32), run(name, jnp.float64)
     assert single.ys.q.dtype == single.audit.energy.dtype == jnp.float32

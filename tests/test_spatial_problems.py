@@ -32,6 +32,7 @@ def leak(solution):
     return np.max(np.abs(energy - energy[0])) / np.max(solution.audit.kinetic)
 
 
+@pytest.mark.slow
 def test_the_steady_top_precesses_as_its_closed_form():
     solution = run("steady_top", 2e-3, 250, 50)
     for t, q in zip(solution.ts, solution.ys.q, strict=True):

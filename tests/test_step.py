@@ -68,6 +68,7 @@ def test_the_memory_of_earlier_steps_saves_iterations_and_changes_no_result():
 
 
 @pytest.mark.parametrize("save_every", [5, 100])
+@pytest.mark.slow_for("5")
 def test_saving_less_selects_rows(save_every):
     full = solve("pendulum", "decaying", 0.5, h=H, steps=STEPS)
     thin = solve("pendulum", "decaying", 0.5, h=H, steps=STEPS, save_every=save_every)
@@ -131,6 +132,7 @@ def there_and_back(scheme, alpha=0.0):
 
 
 @pytest.mark.parametrize("scheme", REVERSIBLE)
+@pytest.mark.slow_for("consistent")
 def test_symmetric_schemes_go_back_the_way_they_came(scheme):
     """A composition does so by way of its own backward stages."""
     error, way = there_and_back(scheme)
@@ -203,6 +205,7 @@ FINDERS = ["Newton", "Chord", "Dogleg", "LevenbergMarquardt"]
 
 
 @pytest.mark.parametrize("name", long(FINDERS, "Dogleg", "LevenbergMarquardt"))
+@pytest.mark.slow_for("Newton")
 def test_another_root_finder_can_be_used(name):
     """The step equations are scaled, so a plain tolerance of a library does."""
     system, start, args = problem("pendulum")

@@ -175,6 +175,7 @@ def test_a_killed_sweep_is_resumed_on_other_devices(tmp_path):
     compare(result)
 
 
+@pytest.mark.slow
 def test_two_processes_find_the_same_results_as_one(tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

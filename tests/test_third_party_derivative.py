@@ -36,6 +36,7 @@ def height(g, num_steps=50):
     return ej.simulate(system, scheme, start, world, h=0.01, num_steps=num_steps)
 
 
+@pytest.mark.slow
 def test_it_keeps_the_energy_and_converges_to_the_motion():
     sol, system = height(9.81), ej.problems.pendulum()
     scale = np.max(sol.audit.kinetic)

@@ -197,6 +197,7 @@ def test_a_hinge_of_ones_own_takes_torsion_springs_and_drives():
 # Forces ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_spring_of_ones_own_is_the_built_in_one_and_reads_its_force():
     """Without its cubic term; with it the force is that of its definition."""
     ends = []

@@ -47,6 +47,7 @@ def test_its_order_is_two_with_constraints(orders):
         assert np.all(np.abs(slopes - 2) < 0.1)  # truncation
 
 
+@pytest.mark.slow
 def test_it_can_be_composed(orders):
     assert orders.order_q[1, 0] > 3.7  # truncation
 

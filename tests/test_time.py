@@ -62,6 +62,7 @@ def depends(jaxpr, source):
 
 
 @pytest.mark.parametrize("scheme", ["preserving", "consistent damped"])
+@pytest.mark.slow_for("consistent damped")
 def test_without_force_and_drive_there_is_no_time(scheme):
     system = ej.System(kinetic, potential, lambda q, args: jnp.array([q @ q - 1.0]))
     start = ej.State([1.0, 0.0], [0.0, 0.0])

@@ -55,6 +55,7 @@ def bead_of_varying_inertia(metre, second, kilogram):
 
 
 @pytest.mark.parametrize("make", [rod_of_varying_length, bead_of_varying_inertia])
+@pytest.mark.slow_for("rod_of_varying_length")
 def test_the_motion_does_not_depend_on_units(make):
     """Not by the correction of a discrete gradient either, which adds squares of all."""
     scheme = ej.EnergyPreserving(derivative=ej.Gonzalez())

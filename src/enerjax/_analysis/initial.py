@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._operators import make_model
-from .._programs import compiled, compiled_for_once, is_known
+from .._programs import compiled_for_once, is_known
 from .._system import AbstractSystem, check_system, State, System
 from .._types import (
     Args,
@@ -220,7 +220,7 @@ def _indices(name: str, indices: EntryIndices, x: Array) -> tuple[int, ...]:
     return tuple(sorted(set(array.tolist())))
 
 
-@compiled
+@compiled_for_once
 def _project(
     system: AbstractSystem,
     guess: State,

@@ -5,7 +5,7 @@ are then known when the pattern is found.
 """
 
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -63,6 +63,12 @@ class _Conditions(eqx.Module):
         constraint = self.model.constraint(q, self.t)
         return jnp.concatenate([constraint, (q - self.guess)[known]])
 
+    def pull_back(self, q: Coordinates) -> tuple[Array, Callable[[Array], Any]]:
+        """The conditions, and the product of their transposed Jacobian with a vector."""
+        # JAX keeps the name of a function with its derivative. That of a module is the text
+        # of all its arrays, and takes seconds for a mechanism of many bodies.
+        return jax.vjp(lambda q: self(q), q)
+
     def scales(self) -> tuple[Array, Array]:
         """The counterparts of `constraint` and `constraint_size` of `Scales`."""
         scales, known = self.model.scales, jnp.asarray(self.known, int)
@@ -89,7 +95,7 @@ def project_position(
         coordinate = conditions.model.scales.coordinate
         unit, rounding = conditions.scales()
         shift, mu = size * x[0] / coordinate, size * x[1] / unit
-        constraint, transpose = jax.vjp(conditions, conditions.guess + shift)
+        constraint, transpose = conditions.pull_back(conditions.guess + shift)
         force = metric @ shift + transpose(mu)[0]
         return force / (size * coordinate), constraint / (size * unit + rounding)
 
@@ -125,7 +131,7 @@ def _explains_error(conditions: _Conditions, metric: Symmetric) -> Flag:
 
         def linearised(x: Array) -> Array:
             shift, mu = x[: q.size] / coordinate, x[q.size :] / unit
-            _, transpose = jax.vjp(conditions, q)
+            _, transpose = conditions.pull_back(q)
             change = jax.jvp(conditions, (q,), (shift,))[1] - residual
             force = metric @ shift + transpose(mu)[0]
             return jnp.concatenate([force / coordinate, change / unit])
@@ -134,8 +140,12 @@ def _explains_error(conditions: _Conditions, metric: Symmetric) -> Flag:
         x = affine_root(linearised, like, model.regularisation_after(q, unit.size))
         return x[: q.size] / coordinate
 
-    first = correction(conditions(q))
-    second = correction(conditions(q - first))
+    # In a loop, so that the equations for both are compiled once.
+    def after(at: Coordinates, _: None) -> tuple[Coordinates, Coordinates]:
+        step = correction(conditions(at))
+        return at - step, step
+
+    _, (first, second) = jax.lax.scan(after, q, None, length=2)
     length = lambda x: jnp.sqrt(x @ metric @ x)
     return length(second) <= 0.2 * length(first)
 

@@ -13,6 +13,7 @@ from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array, PyTree
 
 from .jaxprs import is_known
+from .machine_code.calls import left_to_xla
 
 
 # XLA's CPU back end has two generators of code for merged operations. The newer one, which
@@ -40,7 +41,7 @@ def compiled(fn: Callable[Arguments, Value]) -> Callable[Arguments, Value]:
 
 def compiled_for_once(fn: Callable[Arguments, Value]) -> Callable[Arguments, Value]:
     """`compiled(fn)` for a program that runs so rarely that its speed does not count."""
-    return _compiled(fn, _FOR_ONCE)
+    return _compiled(left_to_xla(fn), _FOR_ONCE)
 
 
 def _compiled(
