@@ -346,6 +346,8 @@ PROGRAMS = {
 
 @pytest.mark.parametrize("name", long(PROGRAMS, "long sums"))
 def test_values_and_derivatives(name):
+    if name == "searched" and jax.__version_info__ >= (0, 12):
+        pytest.skip("`searchsorted` is an operation of its own, without machine code")
     fn = PROGRAMS[name]
     other = in_one_function(fn)
     assert is_compiled(other, X)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._programs import parts_of_scan
 from .arithmetic import both
 from .piecewise import share
 from .transform import (
@@ -31,7 +32,7 @@ def _with_increments(values: list[Value], inexact: list[bool]) -> list[Value]:
 def scan(values: list[Value], params: dict[str, Any]) -> list[Value]:
     """A scan over the rule of its body, which carries the increment along."""
     walk, body = params["walk"], params["jaxpr"]
-    num_consts, num_carry = params["num_consts"], params["num_carry"]
+    num_consts, num_carry = parts_of_scan(params)
     refuse_choices(values)
     consts, carry = values[:num_consts], values[num_consts : num_consts + num_carry]
     xs = values[num_consts + num_carry :]

@@ -22,6 +22,7 @@ from .jaxprs import (
     interpret as interpret,
     is_known as is_known,
     name_of as name_of,
+    parts_of_scan as parts_of_scan,
     programs_within as programs_within,
     wrapped_program as wrapped_program,
 )

@@ -64,6 +64,23 @@ def evaluate(primitive: Any, values: list[Any], params: dict[str, Any]) -> list[
     return list(out) if primitive.multiple_results else [out]
 
 
+def with_constants_as_inputs(jaxpr: Jaxpr) -> Jaxpr:
+    """The program whose first inputs are its constants."""
+    # Since JAX 0.11 a program holds the values of its constants.
+    if hasattr(jaxpr, "with_consts"):
+        return jaxpr.with_consts([])
+    return jaxpr.replace(constvars=[], invars=[*jaxpr.constvars, *jaxpr.invars])
+
+
+def parts_of_scan(params: dict[str, Any]) -> tuple[int, int]:
+    """How many inputs of a scan are constant, and how many are carried."""
+    # Since JAX 0.11 a tree of the inputs says it.
+    if "num_consts" in params:
+        return params["num_consts"], params["num_carry"]
+    constant, carried, _ = params["ft_in"].unpack()
+    return len(constant), len(carried)
+
+
 def name_of(equation: Any) -> str:
     """The name under which tables of rules list an equation.
 

@@ -20,7 +20,7 @@ from jax.interpreters import ad, batching, mlir
 from jax.interpreters.partial_eval import dce_jaxpr_consts
 from jaxtyping import Array, PyTree
 
-from ..jaxprs import known_numbers
+from ..jaxprs import known_numbers, with_constants_as_inputs
 from .evaluation import NAME
 from .library import compiled_function, Function, graph_of
 from .values import Unsupported
@@ -108,8 +108,8 @@ def _called(fn: Callable[..., PyTree[Array]], is_part: bool, *args: PyTree[Array
 class Program:
     """A program as the parameter of a primitive.
 
-    - `jaxpr`: its constants are passed as the first inputs. They can be traced, and a
-      program that held them would outlive their trace.
+    - `jaxpr`: its first inputs are constants. They can be traced, and a program that held
+      them would outlive their trace.
     - `known`: the values of those inputs that are known; `None` for the others.
     - `is_part`: whether the program is a part of a larger one. If the larger one is one
       function, the part is not a function of its own.
@@ -146,9 +146,7 @@ class Program:
         """The outputs, computed by operations of JAX."""
         pairs = zip(numbers, self.known, strict=True)
         values = [x if known is None else known for x, known in pairs]
-        count = len(self.jaxpr.constvars)
-        closed = ClosedJaxpr(self.jaxpr, values[:count])
-        return jaxpr_as_fun(closed)(*values[count:])
+        return jaxpr_as_fun(ClosedJaxpr(self.jaxpr, ()))(*values)
 
     def run(self, numbers: Sequence[Array]) -> list[Array]:
         """The outputs, computed by machine code where that is possible."""
@@ -191,6 +189,7 @@ def run_closed(
             known_numbers(x) if k < num_consts else _known_places(x)
             for k, x in enumerate(needed)
         ]
+        jaxpr = with_constants_as_inputs(jaxpr)
         program = Program(jaxpr, known, is_part, num_linear)
         out = program.bind(list(map(jnp.asarray, needed)))
     _, variables = _split(computed, closed.jaxpr.outvars)

@@ -109,8 +109,7 @@ class Evaluation:
             values = values[: len(program.known)]
             pairs = zip(values, program.known, strict=True)
             own = [x if known is None else known for x, known in pairs]
-            count = len(program.jaxpr.constvars)
-            return self.outputs(program.jaxpr, own[:count], own[count:])
+            return self.outputs(program.jaxpr, [], own)
         from .loops import LOOPS
 
         if name in LOOPS:

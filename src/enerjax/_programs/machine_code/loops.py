@@ -11,6 +11,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from ..counting import num_equations
+from ..jaxprs import parts_of_scan
 from .graph import Node, Number, Region
 from .values import (
     Block,
@@ -371,7 +372,7 @@ def _as_types(values: list[Value], avals: Sequence[Any]) -> list[Value]:
 def _scan(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
     params = eqn.params
     closed, length, reverse = params["jaxpr"], params["length"], params["reverse"]
-    first, count = params["num_consts"], params["num_carry"]
+    first, count = parts_of_scan(params)
     consts, carry, rows = (
         values[:first],
         values[first : first + count],
