@@ -68,7 +68,7 @@ def with_constants_as_inputs(jaxpr: Jaxpr) -> Jaxpr:
     """The program whose first inputs are its constants."""
     # Since JAX 0.11 a program holds the values of its constants.
     if hasattr(jaxpr, "with_consts"):
-        return jaxpr.with_consts([])
+        return jaxpr.with_consts([])  # pyright: ignore
     return jaxpr.replace(constvars=[], invars=[*jaxpr.constvars, *jaxpr.invars])
 
 
