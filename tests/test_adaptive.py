@@ -246,6 +246,7 @@ def test_lanes_choose_their_own_steps():
         np.testing.assert_allclose(q[lane], alone, rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_steps_as_they_were_chosen():
     """Against differences of a loop over these steps."""
     system, start, args = problem("pendulum")

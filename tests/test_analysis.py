@@ -110,6 +110,7 @@ def test_a_missing_equilibrium_raises_an_error():
         ej.equilibrium(free, start, args)
 
 
+@pytest.mark.slow
 def test_modes_of_a_hanging_chain():
     """Transverse modes are those of a string of beads, in the limit Bessel's."""
     num_links = 40

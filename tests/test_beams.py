@@ -256,6 +256,7 @@ def test_a_flying_beam_keeps_its_balances(spaghetti):
     np.testing.assert_allclose(angular, angular[0], rtol=1e-14 * len(angular))
 
 
+@pytest.mark.slow
 def test_a_flying_beam_moves_as_published(spaghetti):
     """Displacements of a spectral solution; the error is that of 16 elements."""
     beam, scene, sol = spaghetti

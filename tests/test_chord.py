@@ -426,6 +426,7 @@ def test_residuals_of_two_levels_may_shrink_in_turn(searched_by):
     assert jnp.max(jnp.abs(sol.audit.leak)) <= 1e3 * EPS * jnp.max(sol.audit.kinetic)
 
 
+@pytest.mark.slow
 def test_what_is_round_off_grows_with_the_system(searched_by):
     """The residual of 512 points in their first steps stays above 1e-13."""
     system, start, args = ej.problems.chain(512)
@@ -436,6 +437,7 @@ def test_what_is_round_off_grows_with_the_system(searched_by):
 
 
 @pytest.mark.parametrize("damped", long([False, True], True))
+@pytest.mark.slow
 def test_stiff_forces_are_noticed_before_the_first_program(searched_by, damped):
     """A row of points on springs, or in dampers, of ten radians a step."""
     size, h, strength = 12, 0.01, 1e3
@@ -501,6 +503,7 @@ def test_a_failure_that_newton_cannot_mend_is_made_once(searched_by):
     assert len(searched_by) == 1
 
 
+@pytest.mark.slow
 def test_a_run_that_fails_in_both_ways_is_forgotten(searched_by):
     system, start, args = ej.problems.chain(5)
 

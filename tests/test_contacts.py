@@ -35,6 +35,7 @@ INERTIA = 0.1 + 0.25
 SPEED = np.sqrt(2 * 9.81 * 0.5 * np.sin(1.0) / INERTIA)
 
 
+@pytest.mark.slow
 def test_a_bar_hits_a_stop_and_comes_to_rest():
     scene, sol = run(bar(contacts.Restitution(0.5)), GRAVITY, num_steps=160)
     count = int(sol.events.count)

@@ -95,6 +95,7 @@ def test_derivatives_through_a_bounce_are_those_of_the_closed_form():
     np.testing.assert_allclose(slope, jax.grad(exact)(numbers), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_lanes_have_events_of_their_own():
     heights = jnp.array([0.3, 1.0, 50.0, 0.7])
     numbers = lambda h0: jnp.stack([h0, *jnp.array([0.9, 9.81, 0.01])])
@@ -424,6 +425,7 @@ def test_bounces_that_accumulate_end_in_rest(resting):
     assert resting.multipliers.shape[1] == 0
 
 
+@pytest.mark.slow
 def test_a_particle_leaves_a_sphere_where_the_force_would_pull():
     # From energy and Newton's law: at the height 2/3 + v0^2/(3 g) of a sphere of radius 1.
     v0 = 0.3

@@ -33,6 +33,7 @@ def test_a_linear_spring_is_right_at_every_step():
     assert [row for row in rows if row.verdict != RIGHT] == []
 
 
+@pytest.mark.slow
 def test_a_stiff_quartic_spring_is_right_or_reports_a_failure():
     rows = [row for row in steps() if row.case == "quartic spring"]
     assert {row.verdict for row in rows} <= {RIGHT, LAW, REPORTED}

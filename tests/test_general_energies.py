@@ -71,6 +71,7 @@ def differences(fn, x, step=1e-5):
     return [(fn(x + row) - fn(x - row)) / (2 * step) for row in rows]
 
 
+@pytest.mark.slow
 def test_gradients_of_a_bead_on_a_parabola():
     """Its inertia varies; by the curvature, and by the alpha of the scheme."""
     system = ej.System.from_lagrangian(
@@ -188,6 +189,7 @@ def test_a_relativistic_oscillator_keeps_its_energy():
     np.testing.assert_allclose(run.ys.q[-1, 0], exact.y[0, -1], atol=2e-3)  # truncation
 
 
+@pytest.mark.slow
 def test_a_start_is_made_consistent_in_positions_and_momenta():
     system, start, args = ej.problems.heavy_top_canonical()
     found = ej.consistent_start(system, 1.1 * start.q, start.v + 3 * start.q, args)

@@ -42,6 +42,7 @@ def damped(t, k, c):
     return fade * swing, -fade * k / w * np.sin(w * t)
 
 
+@pytest.mark.slow
 def test_a_damper_from_positions_and_energies():
     t = 0.05 * np.arange(41)
     x, v = damped(t, 10.0, 0.4)

@@ -97,7 +97,7 @@ def test_zeros_at_one_point_only_are_not_constant():
 
 
 @pytest.mark.parametrize("jit", [False, True])
-@pytest.mark.slow_for("True")
+@pytest.mark.slow
 def test_a_body_in_euler_parameters_has_blocks_for_position_and_rotation(jit):
     """The three entries of the place of the top are themselves."""
     system, start, args = problems.heavy_top()

@@ -192,6 +192,7 @@ def test_integers_and_lists_are_accepted_as_vectors():
     assert same.v.dtype == start.v.dtype
 
 
+@pytest.mark.slow
 def test_a_light_slow_body_is_projected_as_accurately_as_a_heavy_fast_one():
     """The tolerance applies to each unknown, so the pendulum keeps its rod."""
 
@@ -221,6 +222,7 @@ def test_far_from_the_origin_a_wrong_length_is_still_seen():
     assert run(1.0 + 1e-3).result == ej.RESULTS.inconsistent_start
 
 
+@pytest.mark.slow
 def test_known_entries_stay_and_the_rest_follows():
     system, _, args = problem("double")
 

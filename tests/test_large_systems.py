@@ -134,6 +134,7 @@ def test_a_dense_matrix_of_columns_that_are_found_together():
     np.testing.assert_allclose(found, jax.jacfwd(fn)(x), rtol=0, atol=10 * EPS)
 
 
+@pytest.mark.slow
 def test_the_inertia_of_many_bodies_is_kept_in_blocks():
     rng = np.random.default_rng(0)
     blocks = rng.normal(size=(30, 3, 3))

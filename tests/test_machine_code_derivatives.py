@@ -17,6 +17,7 @@ def smooth(x):
     return jnp.sum(jnp.sin(x) * jnp.tanh(x[::-1])) * x
 
 
+@pytest.mark.slow
 def test_derivatives_and_lanes():
     whole, xs = in_one_function(smooth), jnp.stack([SMALL, 2 * SMALL, 3 * SMALL])
     total = lambda f: lambda x: jnp.sum(f(x) ** 2)
@@ -140,6 +141,7 @@ def test_derivatives_of_batches(name, axes, jit):
     jax.tree.map(close, found, expected)
 
 
+@pytest.mark.slow
 def test_inputs_that_become_constants_are_passed_as_inputs():
     """XLA must not put them inside: inputs that are not used end the process."""
     # `eigvalsh` keeps the step from being one function; the search for the start is one.

@@ -98,6 +98,7 @@ def test_the_results_can_be_plotted():
         plt.close("all")
 
 
+@pytest.mark.slow
 def test_a_failed_run_has_a_row_with_the_reason():
     system, start, args = problem("double")
     schemes = {"kappa": ej.KappaDecaying(0.5), "good": ej.EnergyPreserving()}
@@ -150,6 +151,7 @@ def _solved(diffrax, problem, duration):
     return term, jax.tree.map(lambda x: x[-1], solution.ys)
 
 
+@pytest.mark.slow
 def test_diffrax_on_the_double_pendulum():
     diffrax = pytest.importorskip("diffrax")
     system, start, args = problem("double")

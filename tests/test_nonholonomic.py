@@ -307,6 +307,7 @@ def disc_symmetries(q, args):
     return jnp.stack([turned.ravel(), spun.ravel()])
 
 
+@pytest.mark.slow
 def test_the_nutation_of_a_rolling_disc(disc):
     _, system, start, args = disc
     found = np.asarray(ej.eigenvalues(system, start, args, symmetry=disc_symmetries))

@@ -273,6 +273,7 @@ def test_files_show_each_frame_for_its_time(tmp_path):
             film.save(tmp_path / "missing" / "run.mp4", dpi=30)
 
 
+@pytest.mark.slow
 def test_a_film_of_points_needs_no_scene():
     _, sol = hung()
     along = lambda y: jnp.stack([jnp.cos(y.q[2]), jnp.sin(y.q[2])])

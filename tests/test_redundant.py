@@ -102,6 +102,7 @@ def test_the_motion_is_that_of_the_independent_constraints(scheme):
     assert np.max(np.abs(run.audit.constraint_rate)) <= 2e-11
 
 
+@pytest.mark.slow
 def test_multipliers_are_of_least_norm():
     system, args = _beam(4, redundant=True)
     state = _start(system, args)
@@ -168,6 +169,7 @@ def test_relations_between_coordinates_have_no_part_in_the_norm():
     np.testing.assert_allclose(run.multipliers[1, :10], least, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_rods_that_contradict_each_other_are_not_followed():
     """A point on two rods whose feet are nearly the same cannot move."""
 

@@ -501,6 +501,7 @@ def swing_about_the_pivot(moments, time):
 
 
 @pytest.mark.parametrize("name", FLAT)
+@pytest.mark.slow_for("plate")
 def test_a_flat_hung_body_swings_as_eulers_equations(name):
     system, args = flat_system(name)
     begin, time, errors = turning(SPEED), 0.5, []

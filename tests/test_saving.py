@@ -58,6 +58,7 @@ def test_rows_of_a_prime_number_of_steps():
     np.testing.assert_allclose(thin.ys.q, full.ys.q[::31], rtol=0, atol=100 * EPS)
 
 
+@pytest.mark.slow
 def test_a_function_of_the_state_is_saved_in_its_place():
     height = lambda t, state, args: {"y": args["l"] * state.q[1], "t": t, "row": 1}
     told, full = run(ej.SaveAt(every=8, fn=height)), every_step()
@@ -70,6 +71,7 @@ def test_a_function_of_the_state_is_saved_in_its_place():
     np.testing.assert_allclose(within.ys["y"], timed().ys.q[:, 1], rtol=0, atol=100 * EPS)
 
 
+@pytest.mark.slow
 def test_every_accepted_step_of_a_controller_is_counted():
     options = dict(t1=1.0, controller=ej.StepController(1e-5, 1e-5), max_steps=128)
     each, thin = (run(ej.SaveAt(every=k), **options) for k in (1, 5))

@@ -153,6 +153,7 @@ def points():
     )
 
 
+@pytest.mark.slow
 def test_lengths_and_forces_equal_those_computed_by_hand():
     scene = points()
     start = scene.start()

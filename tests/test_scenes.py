@@ -40,6 +40,7 @@ def run(system, start, args, num_steps=200):
     )
 
 
+@pytest.mark.slow
 def test_a_double_pendulum_of_parts_is_the_one_written_by_hand():
     scene, system, start, args = double_pendulum()
     ours, reference = (

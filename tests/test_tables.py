@@ -45,6 +45,7 @@ COORDINATES = ["crank.x", "crank.y", "crank.angle", "bob.x", "bob.y"]
 VELOCITIES = ["crank.vx", "crank.vy", "crank.angle_rate", "bob.vx", "bob.vy"]
 
 
+@pytest.mark.slow
 def test_a_csv_file_has_every_digit(tmp_path):
     sol = run()
     sol.to_csv(tmp_path / "a.csv")
