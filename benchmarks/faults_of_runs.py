@@ -30,6 +30,22 @@ FAULTS = (
         of("approximate_inverses::test_pivots_are_the_largest_entries"),
     ),
     Fault(
+        "rounds: fill is lost",
+        "_solvers/linear/graph_elimination.py",
+        "entries.setdefault(int(block[a, b]), []).append(at)",
+        "entries[int(block[a, b])] = [at]",
+        "Of two nodes of a round that change the same entry only one does.",
+        of("chord::test_the_matrix_of_the_multipliers_is_that_of_dense_algebra"),
+    ),
+    Fault(
+        "rounds: neighbours in one round",
+        "_solvers/linear/graph_elimination.py",
+        "                blocked |= near[k]\n",
+        "",
+        "Nodes that are coupled are eliminated in the same round.",
+        of("chord::test_the_matrix_of_the_multipliers_is_that_of_dense_algebra"),
+    ),
+    Fault(
         "blocks: derivative by the matrix",
         "_solvers/linear/independent_blocks.py",
         "dright - _times(dblocks, x)",
