@@ -765,6 +765,17 @@ def test_an_interrupt_while_a_branch_is_compiled_comes_after_it(monkeypatch):
     np.testing.assert_allclose(compiled(x), jax.jit(fn)(x), rtol=1e-13, atol=1e-13)
 
 
+def test_other_processors_compute_all_lanes_at_the_same_time(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    fn, xs = lambda x: (jnp.sin(x) * x).sum(), jnp.arange(21.0).reshape(7, 3)
+    lanes = jax.jit(jax.vmap(in_one_function(fn)))
+    text = lanes.trace(xs).lower(lowering_platforms=("cuda",)).as_text()
+    assert "while" not in text  # a loop over the lanes
+    np.testing.assert_allclose(lanes(xs), jax.vmap(fn)(xs), rtol=4 * EPS)
+    rates = jax.jit(jax.vmap(jax.grad(in_one_function(fn))))(xs)
+    np.testing.assert_allclose(rates, jax.vmap(jax.grad(fn))(xs), rtol=4 * EPS)
+
+
 @pytest.mark.slow
 def test_results_of_many_lanes_are_computed_in_chunks(monkeypatch):
     from enerjax._programs.machine_code import calls

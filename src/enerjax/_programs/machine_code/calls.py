@@ -301,7 +301,7 @@ def _lanes(numbers: Any, axes: Any, *, program: Program) -> tuple[list, list[int
 def _of_lanes(
     program: Program, own: list[Array], shared: list[Array], batched: list[bool]
 ) -> list[Array]:
-    """The outputs for all lanes: each has the iterations that it needs."""
+    """The outputs for all lanes. On CPUs each has the iterations that it needs."""
     of_lane = lambda own: program(_merged(batched, own, shared))
     if any(map(_is_sharded, own)):
         # Each device computes its own lanes.
@@ -312,6 +312,17 @@ def _of_lanes(
         closed = jax.make_jaxpr(jax.vmap(of_lane))(own)
         wanted = [True] * len(closed.out_avals)
         return run_closed(closed, own, wanted, program.is_part, len(own))
+    in_turn = lambda own: _in_turn(program, of_lane, own)
+    if jax.default_backend() == "cpu":
+        return in_turn(own)
+    # Other processors would take the lanes one by one there.
+    return jax.lax.platform_dependent(own, cpu=in_turn, default=jax.vmap(of_lane))
+
+
+def _in_turn(
+    program: Program, of_lane: Callable[[list[Array]], list[Array]], own: list[Array]
+) -> list[Array]:
+    """The outputs for all lanes, by a loop that makes several passes at a time."""
     closed = lambda own: jax.make_jaxpr(lambda own: jax.lax.map(of_lane, own))(own)
     run = lambda own: run_closed(closed(own), own, wanted, program.is_part)
     wanted, lanes = [True] * len(program.jaxpr.outvars), len(own[0])
