@@ -10,6 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend import source_info_util
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jaxtyping import Array
 
 from .primitives import CALLS, JIT, LINEAR_SOLVE, WITH_OWN_DERIVATIVE
 
@@ -94,8 +95,20 @@ def name_of(equation: Any) -> str:
     return name
 
 
+def _polynomial(x: Array, *coefficients: Array) -> Array:
+    """A sum of powers by W. Horner's scheme, the coefficients of low powers first."""
+    total = jnp.broadcast_to(coefficients[-1], x.shape)
+    for coefficient in coefficients[-2::-1]:
+        total = total * x + coefficient
+    return total
+
+
 def wrapped_program(equation: Any) -> tuple[Jaxpr, list[Any]] | None:
     """The program and its constants, if an equation only wraps a program."""
+    if equation.primitive.name == "polynomial":
+        # An operation since JAX 0.12, before a program of sums and products.
+        closed = jax.make_jaxpr(_polynomial)(*(x.aval for x in equation.invars))
+        return closed.jaxpr, closed.consts
     name = CALLS.get(equation.primitive.name)
     if name is None:
         return None
