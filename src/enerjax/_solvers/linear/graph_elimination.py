@@ -21,7 +21,7 @@ from ..._programs import at_places
 from .dense import definite_inverse
 
 
-# A round takes as long as so many multiplications more than it makes.
+# The fixed cost of a round, in multiplications.
 _ROUND = 500
 
 
@@ -183,7 +183,7 @@ def _steps(adjacent: Sequence[set[int]], sizes: list[int]) -> tuple[list[Step], 
     """The rounds, and the nodes that they leave."""
     near = [set(others) for others in adjacent]
     left, steps = set(range(len(near))), []
-    # One more round costs more than it saves if it eliminates a few rows only.
+    # A dense matrix of few rows is cheaper than one more round.
     while len(left) > 1 and sum(sizes[k] for k in left) > 4:
         if len(left) > 3 and all(len(near[k]) == len(left) - 1 for k in left):
             break
@@ -248,7 +248,7 @@ class _Blocks:
         return entries[np.argsort(self._rank[entries])]
 
 
-# Entries that no matrix contains: of its size there is a zero and then a one.
+# The numbers that stand for an entry of zero and for one of one in padded blocks.
 _ZERO, _ONE = -2, -1
 
 
