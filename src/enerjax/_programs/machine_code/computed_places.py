@@ -31,13 +31,12 @@ def _at_computed(
     self: "Evaluation", value: Value, starts: list[Number], sizes: Sequence[int]
 ) -> Value:
     """A slice of an array that begins at a computed place of each axis."""
-    memory = self.cellar.contiguous(value)
     if math.prod(sizes) == 0:
-        return np.zeros(tuple(sizes), memory.dtype)
-    strides = np.cumprod([1, *memory.shape[:0:-1]])[::-1]
+        return np.zeros(tuple(sizes), dtype_of(value))
+    memory, strides = self.cellar.regular(value)
     graph, dtype = self.graph, memory.dtype
     offset: Number = 0
-    for start, stride in zip(starts, strides.tolist(), strict=True):
+    for start, stride in zip(starts, strides, strict=True):
         offset = graph.add("i8", offset, graph.multiply("i8", start, stride))
     first = memory.places[tuple(slice(0, n) for n in sizes)]
     if not isinstance(offset, Node):
@@ -77,9 +76,8 @@ def dynamic_update_slice(self: "Evaluation", eqn: Any, values: list[Value]) -> l
     if math.prod(update.shape) == 0:
         return [x]
     begins = _starts(self, starts, x.shape, update.shape)
-    memory = self.cellar.contiguous(update)
+    memory, strides = self.cellar.regular(update)
     first = int(memory.places.ravel()[0])
-    strides = np.cumprod([1, *update.shape[:0:-1]])[::-1].tolist()
 
     def rule(old: Number, *places: Number) -> Number:
         offset: Number = 0
@@ -111,7 +109,7 @@ def gather(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
     numbers, sizes, graph = params["dimension_numbers"], params["slice_sizes"], self.graph
     joint = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
     kept = [axis for axis in range(len(x.shape)) if axis not in joint]
-    strides = np.cumprod([1, *x.shape[:0:-1]])[::-1].tolist()
+    memory, strides = self.cellar.regular(x)
     fills = jax.lax.GatherScatterMode.from_any(params["mode"]) == _FILLS
     first, inside = _first_places(self, x, indices, params, strides, fills)
     window = np.zeros([sizes[k] for k in kept], np.int64)
@@ -124,7 +122,6 @@ def gather(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
         [value],
         dict(shape=out.shape, broadcast_dimensions=dims, sharding=None),
     )[0]
-    memory = self.cellar.contiguous(x)
     start, filling = int(memory.places.ravel()[0]), _filling(params, dtype)
 
     def taken(first, within, on):

@@ -1,5 +1,6 @@
 """Programs of JAX, evaluated with nodes of the graph in place of numbers."""
 
+import collections
 import functools
 import math
 from collections.abc import Callable, Sequence
@@ -29,6 +30,7 @@ from .values import (
     Memory,
     MOST_CELLS,
     objects,
+    shared,
     type_name,
     Unsupported,
     Value,
@@ -60,11 +62,17 @@ class Evaluation:
         """The values of the outputs of a program."""
         known: dict[Any, Value] = dict(zip(jaxpr.constvars, consts, strict=True))
         known.update(zip(jaxpr.invars, args, strict=True))
+        uses = collections.Counter(
+            x
+            for atoms in (*(eqn.invars for eqn in jaxpr.eqns), jaxpr.outvars)
+            for x in atoms
+            if not isinstance(x, Literal)
+        )
 
         def read(atom: Any) -> Value:
             if isinstance(atom, Literal):
                 return np.asarray(atom.val, atom.aval.dtype)  # pyright: ignore
-            return known[atom]
+            return shared(known[atom]) if uses[atom] > 1 else known[atom]
 
         for eqn in jaxpr.eqns:
             try:

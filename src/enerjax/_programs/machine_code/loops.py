@@ -6,7 +6,7 @@ Operations of a body that do not depend on the carry are moved out of it.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, TYPE_CHECKING
+from typing import Any, TYPE_CHECKING, TypeGuard
 
 import numpy as np
 
@@ -15,12 +15,14 @@ from ..jaxprs import parts_of_scan
 from .graph import Node, Number, Region
 from .values import (
     Block,
+    Carried,
     Cells,
     CONSTANTS,
     dtype_of,
     Memory,
     MOST_CELLS,
     objects,
+    shared,
     type_name,
     Unsupported,
     usual_lane,
@@ -90,13 +92,16 @@ class Branch:
         return self.branches
 
 
-def _finish(self: "Evaluation", item: Any, extra: Sequence[Node] = ()) -> None:
-    """Puts an item into the current region, after all that it reads."""
+def _finish(
+    self: "Evaluation", item: Any, extra: Sequence[Node] = (), least: int = 0
+) -> None:
+    """Puts an item into the current region, after all that it reads, at `least` there."""
     region = self.graph.current
     item.level = max(
         (x.level for x in [*_read_from(region, item), *extra] if x.region is region),
-        default=0,
+        default=least,
     )
+    item.level = max(item.level, least)
     region.items.append(item)
 
 
@@ -262,44 +267,60 @@ def _same_through(jaxpr: Any, count: int, first: int, offset: int = 0) -> list[b
 
 
 class _Carry:
-    """The cells of a carry."""
+    """The cells of a carry.
 
-    def __init__(self, self_: "Evaluation", values: list[Value], same: list[bool]):
+    Those of a loop in the body of another loop can be those of the carry of that loop,
+    whose values it changes: only a loop that changes no cells of passes that have ended
+    `takes_over` cells.
+    """
+
+    def __init__(
+        self,
+        self_: "Evaluation",
+        values: list[Value],
+        same: list[bool],
+        takes_over: bool = False,
+    ):
         self.evaluation = self_
         self.values, self.same = values, same
         # The owners say in which region the cells are read; see `While`.
-        self.owners: list[Block] = []
-        self.places = []
+        self.owners: list[list[Block]] = []
+        self.places: list[np.ndarray | None] = []
+        # The level from which the cells that are taken over can be read.
+        self.ready = 0
         for value, stays in zip(values, same, strict=True):
-            if stays or math.prod(value.shape) == 0:
-                self.places.append(None)
-                continue
-            owners, places = _block(self_, value)
-            self.owners += owners
+            owners, places = [], None
+            if takes_over and not stays and self._is_taken_over(value):
+                owners, places = value.owners, value.places
+                self.ready = max([self.ready, *(x.ready for x in owners)])
+            elif not stays and math.prod(value.shape):
+                owners, places = _block(self_, value)
+            self.owners.append(owners)
             self.places.append(places)
+
+    def _is_taken_over(self, value: Value) -> TypeGuard[Carried]:
+        current = self.evaluation.graph.current
+        return isinstance(value, Carried) and value.region is current
 
     def begin(self) -> list[Node]:
         """Writes the values before the loop."""
         graph, out = self.evaluation.graph, []
         for value, places in zip(self.values, self.places, strict=True):
-            if places is not None:
+            if places is not None and not _is_at(value, places):
                 region = graph.current
                 out += _stores(self.evaluation, value, places, region, 0)
         return out
 
     def read(self, region: Region) -> list[Value]:
-        self.evaluation.cellar.hand_over(self.owners, region, 0)
-        return [
-            value if places is None else Memory(dtype_of(value), places)
-            for value, places in zip(self.values, self.places, strict=True)
-        ]
+        """The values in a pass."""
+        return self._in_cells(region, 0)
 
     def commit(self, region: Region, results: list[Value], mask: int | None = None) -> None:
         """Writes the values after a pass, after all else in it."""
         writes = [
             self._prepared(value, places, mask)
             for value, places in zip(results, self.places, strict=True)
-            if places is not None
+            if places is not None and not _is_at(value, places)
         ]
         last = region.last_level() + 1
         for write in writes:
@@ -334,13 +355,23 @@ class _Carry:
         return write
 
     def end(self, level: int) -> list[Value]:
-        """The values after the loop."""
-        graph = self.evaluation.graph
-        self.evaluation.cellar.hand_over(self.owners, graph.current, level + 1)
+        """The values after the loop, which other loops can change in their cells."""
+        return self._in_cells(self.evaluation.graph.current, level + 1)
+
+    def _in_cells(self, region: Region, ready: int) -> list[Value]:
+        owners = [x for own in self.owners for x in own]
+        self.evaluation.cellar.hand_over(owners, region, ready)
         return [
-            value if places is None else Memory(dtype_of(value), places)
-            for value, places in zip(self.values, self.places, strict=True)
+            value if places is None else Carried(dtype_of(value), places, own, region)
+            for value, places, own in zip(
+                self.values, self.places, self.owners, strict=True
+            )
         ]
+
+
+def _is_at(value: Value, places: np.ndarray) -> bool:
+    """Whether an array is in these cells."""
+    return isinstance(value, Memory) and np.array_equal(value.places, places)
 
 
 def _within(self: "Evaluation", region: Region) -> "_Within":
@@ -515,7 +546,7 @@ def _row(self: "Evaluation", x: Value, counter: Node) -> Value:
 
 
 def _written_out(self, closed, consts, carry, rows, length, reverse) -> list[Value]:
-    count, stacked = len(carry), []
+    count, stacked, consts = len(carry), [], [*map(shared, consts)]
     for k in range(length)[:: -1 if reverse else 1]:
         own = [
             self.reshaped(self.subarray(x, (slice(k, k + 1),)), x.shape[1:]) for x in rows
@@ -547,7 +578,8 @@ def _while(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
     body = Region(before)
     item = While(head, before, body, flag_place)
     count = len(carry)
-    cells = _Carry(self, carry, _same_through(closed.jaxpr, count, second))
+    same = _same_through(closed.jaxpr, count, second)
+    cells = _Carry(self, carry, same, takes_over=True)
     written = cells.begin()
     with _within(self, head):
         (goes_on,) = self.closed(params["cond_jaxpr"], [*outer, *cells.read(head)])
@@ -559,7 +591,7 @@ def _while(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
     with _within(self, body):
         outs = self.closed(closed, [*inner, *cells.read(body)])
         cells.commit(body, _as_types(outs, closed.out_avals), flag_place)
-    _finish(self, item, written)
+    _finish(self, item, written, cells.ready)
     return cells.end(item.level)
 
 

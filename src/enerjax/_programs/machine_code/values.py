@@ -65,7 +65,28 @@ class Memory:
         return self.places.shape
 
 
+class Carried(Memory):
+    """The cells of a carry in the body of its loop, where no other operation reads them.
+
+    A loop in the body may have its own carry there.
+
+    - `owners`: who owns the cells.
+    - `region`: the body.
+    """
+
+    def __init__(
+        self, dtype: str, places: np.ndarray, owners: "list[Block]", region: Region
+    ):
+        super().__init__(dtype, places)
+        self.owners, self.region = owners, region
+
+
 Value: TypeAlias = np.ndarray | Cells | Memory
+
+
+def shared(value: Value) -> Value:
+    """A value that several operations can read."""
+    return Memory(value.dtype, value.places) if isinstance(value, Carried) else value
 
 
 def dtype_of(value: Any) -> str:
@@ -456,6 +477,16 @@ class Cellar:
         places = self.place_of(copy, memory.dtype) + np.arange(flat.size)
         return Memory(memory.dtype, places.reshape(memory.shape))
 
+    def regular(self, value: Value) -> tuple[Memory, list[int]]:
+        """The array in memory, and the distance between neighbours along each axis."""
+        memory = self.memory(value)
+        places = self.of_one_memory(memory.places, memory.dtype)
+        memory, strides = Memory(memory.dtype, places), strides_of(places)
+        if strides is None:
+            memory = self.contiguous(memory)
+            strides = np.cumprod([1, *memory.shape[:0:-1]])[::-1].tolist()
+        return memory, strides
+
     def _copied(self, place: int, dtype: str, extra: Any, has_passes: bool) -> int:
         """The cell of a copy; of a known number, too, there is one for each pass."""
         x = self.number_at(place, dtype)
@@ -471,6 +502,32 @@ class Cellar:
         while region.parent is not None and region.parent.is_wide:
             region = region.parent
         return region
+
+
+def strides_of(places: np.ndarray) -> list[int] | None:
+    """The distance between neighbours along each axis, where it is everywhere the same."""
+    if places.size == 0:
+        return [0] * places.ndim
+    # Constants are far from other cells, but not by the distance of their numbers.
+    if np.any(places >= CONSTANTS) and np.any(places < CONSTANTS):
+        return None
+    first = places.ravel()[0]
+    strides = [
+        int(places.take(1, axis).ravel()[0] - first) if n > 1 else 0
+        for axis, n in enumerate(places.shape)
+    ]
+    regular = first + sum(
+        (
+            stride * k
+            for stride, k in zip(
+                strides, np.indices(places.shape, sparse=True), strict=True
+            )
+        ),
+        0,
+    )
+    return (
+        strides if np.array_equal(np.broadcast_to(regular, places.shape), places) else None
+    )
 
 
 def lane_of(values: list[Value], shape: tuple[int, ...]) -> int | None:

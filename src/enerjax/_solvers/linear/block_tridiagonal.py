@@ -77,7 +77,7 @@ class Band:
         """Whether the block elimination needs less work than that of the dense matrix."""
         # A multiplication takes so many times as long as one of the dense elimination. That
         # is by LAPACK, or for a small matrix in plain operations.
-        cost = 40 if self.width < LAPACK_FROM else 8
+        cost = 40 if self.width < 16 else 8
         cost = cost if self.size > SMALL else 10
         return cost * self.num_blocks * self.width**3 < self.size**3
 
@@ -235,7 +235,7 @@ def _substituted(
 
 
 def _times(matrix: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"]:
-    if matrix.shape[1] >= 2 * LAPACK_FROM:
+    if matrix.shape[1] >= 32:
         return matrix @ x
     # XLA vectorises this sum over the rows.
     return jnp.sum(matrix * x[None], axis=1)

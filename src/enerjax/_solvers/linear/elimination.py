@@ -10,7 +10,7 @@ from .dense import order_after, product
 
 
 # Columns from which LAPACK is faster than plain operations.
-LAPACK_FROM = 16
+LAPACK_FROM = 64
 # Columns up to which the loop over columns is unrolled. Longer unrolled loops compile
 # slowly.
 _UNROLLED = 8
@@ -36,7 +36,7 @@ def apply_reduction(
     count = reduction.shape[1]
     rows = rows[order]
     pivots = rows[:count]
-    products = reduction @ pivots if count >= LAPACK_FROM else product(reduction, pivots)
+    products = reduction @ pivots if count >= 16 else product(reduction, pivots)
     return products[:count], rows[count:] + products[count:]
 
 
@@ -56,27 +56,34 @@ def _by_lapack(panel: Float[Array, "m w"]) -> tuple[Array, Array]:
 def _by_gauss_jordan(panel: Float[Array, "m w"]) -> tuple[Array, Array]:
     """In-place Gauss-Jordan elimination, without calls that XLA cannot fuse."""
     num_rows, count = panel.shape
-    numbers = jnp.arange(num_rows)
+    numbers, columns = jnp.arange(num_rows), jnp.arange(count)
 
     def column(k, carry):
-        panel, order = carry
-        sizes = jnp.where(numbers >= k, jnp.abs(panel[:, 0]), -1)
+        # Rows stay where they are until the end. A row has a `place`, and the row at each
+        # place is in `order`.
+        panel, place, order = carry
+        entries = jax.lax.dynamic_index_in_dim(panel, k, 1, keepdims=False)
+        sizes = jnp.where(place >= k, jnp.abs(entries), -1)
         # The first of the largest entries. Two reductions cost less than `argmax`. (If an
         # entry is NaN, all entries become NaN.)
         pivot = jnp.min(jnp.where(sizes == jnp.max(sizes), numbers, num_rows - 1))
-        exchanged = jnp.where(numbers == pivot, k, numbers)
-        exchanged = jnp.where(numbers == k, pivot, exchanged)
-        panel, order = panel[exchanged], order[exchanged]
-        is_pivot = numbers == k
-        # The eliminated column is dropped, and the column of the right-hand side of row `k`
-        # is appended.
-        row = jnp.append(panel[k, 1:], 1) / panel[k, 0]
-        factors = jnp.where(is_pivot, -1, panel[:, 0])
-        rest = jnp.where(is_pivot[:, None], 0, panel[:, 1:])
-        rest = jnp.pad(rest, ((0, 0), (0, 1)))
-        return rest - factors[:, None] * row[None], order
+        row, entry, before, first = (
+            jax.lax.dynamic_index_in_dim(x, at, keepdims=False)
+            for x, at in ((panel, pivot), (entries, pivot), (place, pivot), (order, k))
+        )
+        chosen = numbers == pivot
+        place = jnp.where(chosen, k, jnp.where(numbers == first, before, place))
+        order = jnp.where(numbers == k, pivot, jnp.where(numbers == before, first, order))
+        # Exchanges the unknown of the column with the right-hand side of the row.
+        row = jnp.where(columns == k, 1, row) / entry
+        factors = jnp.where(chosen, 0, entries)
+        kept = jnp.where((columns == k)[None], 0, panel) - factors[:, None] * row[None]
+        return jnp.where(chosen[:, None], row[None], kept), place, order
 
-    carry = panel, numbers
+    carry = panel, numbers, numbers
     if count <= _UNROLLED:
-        return functools.reduce(lambda carry, k: column(k, carry), range(count), carry)
-    return jax.lax.fori_loop(0, count, column, carry)
+        carry = functools.reduce(lambda c, k: column(k, c), range(count), carry)
+    else:
+        carry = jax.lax.fori_loop(0, count, column, carry)
+    panel, _, order = carry
+    return panel[order], order
