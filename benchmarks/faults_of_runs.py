@@ -7,7 +7,7 @@ FAULTS = (
     # Solvers ----------------------------------------------------------------------------
     Fault(
         "band: no pivoting by hand",
-        "_solvers/linear/elimination.py",
+        "_solvers/linear/dense.py",
         "jnp.where(sizes == jnp.max(sizes), numbers, num_rows - 1)",
         "jnp.where(sizes > 0, numbers, num_rows - 1)",
         "The elimination of narrow bands takes the first pivot that is not zero.",
@@ -24,8 +24,8 @@ FAULTS = (
     Fault(
         "inverse: pivots with their sign",
         "_solvers/linear/dense.py",
-        "sizes = jnp.where(free, jnp.abs(entries), -1)",
-        "sizes = jnp.where(free, entries**1, -jnp.inf)",
+        "sizes = jnp.where(place >= k, jnp.abs(entries), -1)",
+        "sizes = jnp.where(place >= k, entries**1, -jnp.inf)",
         "The inverse of a small matrix takes the most positive entry for its pivot.",
         of("approximate_inverses::test_pivots_are_the_largest_entries"),
     ),

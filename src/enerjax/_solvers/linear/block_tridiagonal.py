@@ -19,8 +19,11 @@ import scipy
 from jaxtyping import Array, Float, Int
 
 from ..._programs import batched_columns, columns_along, in_one_function, shape_of
-from .dense import AbstractFactors, SMALL
-from .elimination import apply_reduction, eliminate_columns, LAPACK_FROM
+from .dense import AbstractFactors, eliminated, product, SMALL
+
+
+# Columns from which a product of matrices is faster than sums that XLA fuses.
+_MANY = 16
 
 
 class Band:
@@ -67,17 +70,15 @@ class Band:
         self.padding[block, row, width + row] = 1
 
     def description(self, size: int) -> str:
-        by = "LAPACK" if self.width >= LAPACK_FROM else "plain operations"
         return (
             f"block tridiagonal, {self.num_blocks} blocks of {self.width}, "
-            f"{self.num_colours} columns evaluated together, elimination by {by}"
+            f"{self.num_colours} columns evaluated together"
         )
 
     def is_cheaper_than_dense(self) -> bool:
         """Whether the block elimination needs less work than that of the dense matrix."""
-        # A multiplication takes so many times as long as one of the dense elimination. That
-        # is by LAPACK, or for a small matrix in plain operations.
-        cost = 40 if self.width < 16 else 8
+        # A multiplication takes so many times as long as one of the dense elimination.
+        cost = 40 if self.width < _MANY else 8
         cost = cost if self.size > SMALL else 10
         return cost * self.num_blocks * self.width**3 < self.size**3
 
@@ -165,8 +166,7 @@ class BandFactors(AbstractFactors):
     """The factors of a block tridiagonal matrix.
 
     - `reductions`, `orders`: for each block, the elimination of its unknowns from the rows
-      that remain of the block before and from the rows of the next block; see
-      `eliminate_columns`.
+      that remain of the block before and from the rows of the next block; see `eliminated`.
     - `upper`: the entries of the pivot rows of each block in the next two blocks.
     """
 
@@ -200,9 +200,10 @@ def _eliminated(
         whole = jnp.concatenate(
             [jnp.concatenate([left, none], axis=1), rows]
         )  # two_widths, three_widths
-        reduction, order = eliminate_columns(whole[:, :width])
-        upper, left = apply_reduction(reduction, order, whole[:, width:])
-        return left, (reduction, order, upper)
+        table, _, order = eliminated(whole[:, :width])
+        reduction, rows = table[order], whole[order, width:]
+        products = _product(reduction, rows[:width])
+        return rows[width:] + products[width:], (reduction, order, products[:width])
 
     return jax.lax.scan(eliminate, matrix[0, :, width:], following)[1]
 
@@ -234,8 +235,12 @@ def _substituted(
     return jax.lax.scan(backward, after, (upper, solved), reverse=True)[1]
 
 
+def _product(a: Float[Array, "n k"], b: Float[Array, "k m"]) -> Float[Array, "n m"]:
+    return product(a, b) if len(b) < _MANY else a @ b
+
+
 def _times(matrix: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"]:
-    if matrix.shape[1] >= 32:
+    if matrix.shape[1] >= 2 * _MANY:
         return matrix @ x
     # XLA vectorises this sum over the rows.
     return jnp.sum(matrix * x[None], axis=1)

@@ -22,7 +22,7 @@ from .norms import largest
 # Rows up to which plain operations beat LAPACK.
 SMALL = 32
 # Rows up to which the loop over columns is unrolled. Longer unrolled loops compile slowly.
-_UNROLLED = 3
+_UNROLLED = 8
 # The same for definite matrices, for which no pivots are looked for.
 _UNROLLED_IF_DEFINITE = 16
 
@@ -40,42 +40,12 @@ def enerjax_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 @jax.custom_jvp
 def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """In-place Gauss-Jordan elimination with row pivoting, without exchanging rows."""
-    size = matrix.shape[0]
-    if size == 1:
+    if len(matrix) == 1:
         return 1 / matrix
-    if size > SMALL:
+    if len(matrix) > SMALL:
         return jnp.linalg.inv(matrix)
-    order = jnp.arange(size)
-
-    def column(k, carry):
-        table, free, rows, columns = carry
-        entries = jax.lax.dynamic_slice(table, (0, k), (size, 1))[:, 0]
-        sizes = jnp.where(free, jnp.abs(entries), -1)
-        # The first of the largest entries. Two reductions cost less than `argmax`. (If an
-        # entry is NaN there is none, and the pivot is `size`.)
-        pivot = jnp.min(jnp.where(sizes == jnp.max(sizes), order, size))
-        chosen = order == pivot
-        row = jax.lax.dynamic_slice(table, (pivot, 0), (1, size))[0]
-        entry = jax.lax.dynamic_slice(entries, (pivot,), (1,))[0]
-        # The whole inverse is NaN then.
-        entry = jnp.where(pivot < size, entry, jnp.nan)
-        # Exchanges the unknown of the column with the right-hand side of the row.
-        row = jnp.where(order == k, 1, row) / entry
-        factors = jnp.where(chosen, 0, entries)
-        kept = jnp.where((order == k)[None], 0, table) - factors[:, None] * row[None]
-        table = jnp.where(chosen[:, None], row[None], kept)
-        rows = jnp.where(order == k, pivot, rows)
-        return table, free & ~chosen, rows, jnp.where(chosen, k, columns)
-
-    none = jnp.zeros((size,), order.dtype)
-    carry = matrix, jnp.ones((size,), bool), none, none
-    if size <= _UNROLLED:
-        carry = functools.reduce(lambda c, k: column(k, c), range(size), carry)
-    else:
-        carry = jax.lax.fori_loop(0, size, column, carry)
-    table, _, rows, columns = carry
-    return table[rows][:, columns]
+    table, place, order = eliminated(matrix)
+    return table[order][:, place]
 
 
 @_inverse.defjvp
@@ -84,6 +54,46 @@ def _inverse_jvp(primals, tangents):
     (x,), (dx,) = primals, tangents
     y = inverse(x)
     return y, -product(product(y, dx), y)
+
+
+def eliminated(
+    panel: Float[Array, "m w"],
+) -> tuple[Float[Array, "m w"], Int[Array, " m"], Int[Array, " m"]]:
+    """Gauss-Jordan elimination of `w` unknowns from `m` rows in place, with row pivoting.
+
+    Returns the table, the place of each row, and the row at each place; the first `w`
+    places are those of the pivot rows. In the order of the places, the first `w` rows of
+    the table are the inverse of the pivot rows. The others multiply the pivot rows, and
+    give what is added to the remaining rows to eliminate the unknowns.
+    """
+    num_rows, count = panel.shape
+    numbers, columns = jnp.arange(num_rows), jnp.arange(count)
+
+    def column(k, carry):
+        # Rows stay where they are.
+        table, place, order = carry
+        entries = jax.lax.dynamic_index_in_dim(table, k, 1, keepdims=False)
+        sizes = jnp.where(place >= k, jnp.abs(entries), -1)
+        # The first of the largest entries. Two reductions cost less than `argmax`. (If an
+        # entry is NaN, all entries become NaN.)
+        pivot = jnp.min(jnp.where(sizes == jnp.max(sizes), numbers, num_rows - 1))
+        row, entry, before, first = (
+            jax.lax.dynamic_index_in_dim(x, at, keepdims=False)
+            for x, at in ((table, pivot), (entries, pivot), (place, pivot), (order, k))
+        )
+        chosen = numbers == pivot
+        place = jnp.where(chosen, k, jnp.where(numbers == first, before, place))
+        order = jnp.where(numbers == k, pivot, jnp.where(numbers == before, first, order))
+        # Exchanges the unknown of the column with the right-hand side of the row.
+        row = jnp.where(columns == k, 1, row) / entry
+        factors = jnp.where(chosen, 0, entries)
+        kept = jnp.where((columns == k)[None], 0, table) - factors[:, None] * row[None]
+        return jnp.where(chosen[:, None], row[None], kept), place, order
+
+    carry = panel, numbers, numbers
+    if count <= _UNROLLED:
+        return functools.reduce(lambda c, k: column(k, c), range(count), carry)
+    return jax.lax.fori_loop(0, count, column, carry)
 
 
 class AbstractFactors(eqx.Module):
