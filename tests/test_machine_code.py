@@ -525,8 +525,31 @@ def large_carry(x):
     return jax.lax.while_loop(lambda c: c[0] < 5, turn, (0, numbers))[1]
 
 
+def backwards(x):
+    """Rows from the last to the first, and arrays of a carry that change places."""
+    table = jnp.outer(x.ravel(), jnp.linspace(0.5, 1, 30))
+    turn = lambda c, row: ((c[1], c[0], jnp.max(c[0]) * jnp.cos(row)), c[0] - row)
+    return jax.lax.scan(turn, (table[0], table[1], table[2]), table, reverse=True)
+
+
+def turned_tables(x):
+    """Entries at computed places of an array whose columns are in memory as rows."""
+    table = jnp.outer(jnp.arange(1.0, 31), jnp.linspace(0.5, 1, 24)) * x[0, 0]
+
+    def turn(k, table):
+        column = table[:, k % 7]
+        chosen = jnp.argmax(jnp.abs(column))
+        row = table.T[:, chosen] + table[::-1][chosen]
+        entry = jax.lax.dynamic_slice(table[::2, ::3], (k % 5, k % 4), (2, 3)).sum()
+        return jnp.cos(table - column[:, None] * row[None] / (1 + entry**2))
+
+    return jax.lax.fori_loop(0, 9, turn, table)
+
+
 @pytest.mark.parametrize(
-    "fn", [loops_over_the_same, large_carry], ids=lambda fn: fn.__name__
+    "fn",
+    [loops_over_the_same, large_carry, backwards, turned_tables],
+    ids=lambda fn: fn.__name__,
 )
 def test_loops_that_are_written_as_loops(fn, monkeypatch):
     monkeypatch.setattr(loops, "_WRITTEN_OUT", 0)
@@ -610,6 +633,36 @@ def long_rows(x, y):
     return count, rows.sum(axis=0), kept, several, jnp.roll(table[:, 1], 3) @ rows[:, 0]
 
 
+def loops_in_loops(x, y):
+    """Inner loops whose first values are those of the outer carry, read by others or not.
+
+    Their conditions would hold in lanes that have left the outer loop.
+    """
+    table = jnp.outer(jnp.linspace(0.1, 1, 20), x) + y[0]
+    steps = jnp.where(x[1] > 0, 3, 1)
+
+    def inner(count, table):
+        change = lambda c: (c[0] + 1, jnp.sin(1.3 * c[1][::-1]) + y[1])
+        return jax.lax.while_loop(lambda c: c[0] < count, change, (0, table))[1]
+
+    def turn(carry):
+        k, first, second, third = carry
+        first = inner(2, inner(steps, first))
+        changed = inner(steps, second)
+        swapped = jax.lax.while_loop(
+            lambda c: c[0] < steps,
+            lambda c: (c[0] + 1, c[2], c[1]),
+            (0, third, third[::-1]),
+        )
+        branch = jax.lax.cond(k > 1, lambda z: inner(1, z), jnp.cos, swapped[2])
+        return k + 1, changed, first + 0.1 * second, branch
+
+    carry = 0, table, table[::-1], 2 * table
+    last = jnp.where(y[2] > 0.6, 4, 2)
+    _, *out = jax.lax.while_loop(lambda c: c[0] < last, turn, carry)
+    return [x.sum(axis=0) for x in out]
+
+
 def rows_after_the_first(x, y):
     """The cell before the rows belongs to a number that all lanes may share."""
 
@@ -639,6 +692,7 @@ OF_LANES = [
     running_sums,
     factors_of_lanes,
     long_rows,
+    loops_in_loops,
     rows_after_the_first,
 ]
 
