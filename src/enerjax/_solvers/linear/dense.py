@@ -87,7 +87,8 @@ def eliminated(
         # Exchanges the unknown of the column with the right-hand side of the row.
         row = jnp.where(columns == k, 1, row) / entry
         factors = jnp.where(chosen, 0, entries)
-        kept = jnp.where((columns == k)[None], 0, table) - factors[:, None] * row[None]
+        change = factors[:, None] * row[None]
+        kept = jnp.where((columns == k)[None], -change, table - change)
         return jnp.where(chosen[:, None], row[None], kept), place, order
 
     carry = panel, numbers, numbers
