@@ -20,6 +20,10 @@ _LONGEST, _LONGEST_OF_LANES, _FEW_LANES = 2_500, 300, 256
 _LARGE_BRANCH = 1_000
 
 
+# The longest chain of operations that is moved for the last of them.
+_SUNK_WITH_IT = 8
+
+
 class Emission:
     """The code of a program.
 
@@ -342,6 +346,7 @@ def _kernels(regions: list[Region]) -> dict[tuple, list[Node]]:
             continue
         live.add(node)
         stack.extend(x for x in node.operands if isinstance(x, Node) and x not in live)
+    _sink(live)
     order = {region: k for k, region in enumerate(regions)}
     needed = [x for x in live if x.op not in NOT_COMPUTED and x.region in order]
     # Loops over lanes that are divided write last, when all that they read is read.
@@ -358,3 +363,45 @@ def _kernels(regions: list[Region]) -> dict[tuple, list[Node]]:
             part = parts[key] = part + 1
         kernels.setdefault((*key, part), []).append(node)
     return kernels
+
+
+def _sink(live: set[Node]) -> None:
+    """Moves operations into the kernels that use their results, which need no cells."""
+    users: dict[Node, list[Node]] = {}
+    for node in live:
+        for x in node.operands:
+            if isinstance(x, Node):
+                users.setdefault(x, []).append(node)
+
+    def is_movable(x: Node) -> bool:
+        is_computed = x.op not in NOT_COMPUTED and x.op not in ("store", "copy", "dynamic")
+        return is_computed and not x.is_reduced and x.place is None
+
+    def is_stored(x: Node, apart_from: Node) -> bool:
+        """Whether kernels other than that of `x` read it, apart from one operation."""
+        others = (y for y in users[x] if y is not apart_from)
+        key = x.region, x.level, x.lanes
+        return not is_movable(x) or any((y.region, y.level, y.lanes) != key for y in others)
+
+    def can_move(x: Node, depth: int) -> bool:
+        """Whether no operand has to be stored instead."""
+        for y in x.operands:
+            if not isinstance(y, Node) or y.op in NOT_COMPUTED or y.lanes != x.lanes:
+                continue
+            if y.region is x.region and not is_stored(y, x):
+                goes_along = len(users[y]) == 1 and depth > 0 and can_move(y, depth - 1)
+                if not goes_along:
+                    return False
+        return True
+
+    for x in sorted(live, key=lambda x: -x.number):
+        if not is_movable(x):
+            continue
+        own = users.get(x, [])
+        if any(y.region is not x.region or y.lanes != x.lanes for y in own):
+            continue
+        # What is written to the cells of a carry is computed before, from those cells.
+        level = min((y.level for y in own if y.op != "store"), default=x.level)
+        is_written = any(y.op == "store" for y in own)
+        if level > x.level and not is_written and can_move(x, _SUNK_WITH_IT):
+            x.level = level
