@@ -135,7 +135,8 @@ def with_derivative(function):
 
 @pytest.mark.parametrize("name", long(FUNCTIONS, "solve", "determinant", "inverse"))
 @pytest.mark.slow_for(
-    "hypot", "triangular", "special", "arc", "extremes", "cross", "circular", "hyperbolic"
+    *("hypot", "triangular", "special", "arc", "extremes", "cross", "circular"),
+    *("hyperbolic", "area", "product", "powers", "structure"),
 )
 def test_at_one_point_it_is_the_gradient_and_half_the_hessian(name):
     function = FUNCTIONS[name]

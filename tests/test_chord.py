@@ -202,7 +202,9 @@ AND_JOINTS = [
 @pytest.mark.parametrize(
     ("name", "joined"), [*((x, False) for x in WITH_MOMENTA), *AND_JOINTS]
 )
-@pytest.mark.slow_for("preserving-True", "consistent 0-False")
+@pytest.mark.slow_for(
+    "preserving-True", "consistent 0-False", "decaying-False", "preserving index3-False"
+)
 def test_with_momenta_one_correction_solves_the_step_too(name, joined):
     """With a constant inertia, declared as if it varied."""
     rng = np.random.default_rng(0)

@@ -79,6 +79,7 @@ def test_the_audit_counts_the_loss_of_impacts(bouncing):
     assert np.count_nonzero(audit.impact) == 7
 
 
+@pytest.mark.slow  # A notebook shows it, too.
 def test_derivatives_through_a_bounce_are_those_of_the_closed_form():
     t1 = 0.8
 

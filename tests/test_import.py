@@ -84,6 +84,7 @@ def test_energies_and_joints_are_those_of_the_file(name):
     assert f", {model.nv} degrees of freedom." in str(scene)
 
 
+@pytest.mark.slow_for("walker")
 @pytest.mark.parametrize("name", [x for x in TREES if x not in ("ball_chain", "joints")])
 def test_coordinates_are_those_of_the_file(name):
     scene = ej.scenes.from_mjcf(path(name), keyframe="other")

@@ -88,6 +88,8 @@ CASES = [
     "spring-consistent-1.0-3-0.15-steps19",
     "pendulum-preserving-0.0-2-0.1-steps0",
     "pendulum-composed 4-0.0-4-0.2-steps24",
+    "pendulum-consistent-0.5-3-0.15-steps22",
+    "double-composed 4-0.0-4-0.2-steps25",
 )
 def test_errors_shrink_with_the_order_of_the_scheme(
     name, scheme, alpha, order, deviation, steps
