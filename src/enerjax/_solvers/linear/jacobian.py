@@ -20,7 +20,7 @@ from ..._programs import (
     shape_of,
 )
 from .block_tridiagonal import Band, coloured_products, column_colours
-from .dense import AbstractFactors, Inverse, inverse, LU, SMALL, solve
+from .dense import AbstractFactors, Inverse, inverse, LU, SMALL
 from .user_solver import AbstractSparseSolver, LineaxFactors, Sparse
 
 
@@ -142,14 +142,14 @@ class Linearisable(eqx.Module):
 
     def regularised_solver(self, x: Float[Array, " n"]) -> Callable[[Array], Array]:
         """A function that solves with the regularised Jacobian at `x`."""
-        if self.is_dense and self.regularisation is None and x.size <= SMALL:
+        is_small = self.is_dense and x.size <= SMALL
+        if is_small and self.regularisation is None:
             found = in_one_function(lambda x: inverse(self.jacobian(x)))(x)
             return lambda right: found @ right
         matrix = self.jacobian(x)
-        if self.is_dense:
+        if is_small:
             # An explicit inverse of a nearly singular matrix is too inaccurate.
-            by = solve if self.regularisation is None else jnp.linalg.solve
-            return lambda right: by(matrix, right)
+            return lambda right: jnp.linalg.solve(matrix, right)
         matrix = jax.lax.stop_gradient(matrix)
         factors = self.form.empty(x.size, x.dtype).renewed(matrix)
 
