@@ -17,7 +17,7 @@ from ..numpy_primitives import BY_NUMPY, evaluated, moved, MOVES
 from ..primitives import FACTORS, LINEAR_SOLVE
 from .computed_places import dynamic_slice, dynamic_update_slice, gather, scatter
 from .contraction import contraction
-from .dense import BY_LOOPS, factors_by_loops
+from .dense import by_loops, can_be_loops
 from .elementwise import ELEMENTWISE
 from .graph import as_number, Graph, Node, Number
 from .small_matrices import in_plain_operations, is_small
@@ -621,7 +621,7 @@ def _linear_solve(self: Evaluation, eqn: Any, values: list[Value]) -> list[Value
 def _factors(self: Evaluation, eqn: Any, values: list[Value]) -> list[Value]:
     name = eqn.primitive.name
     small = is_small(eqn)
-    if not small and not (name in BY_LOOPS and eqn.outvars[0].aval.size):
+    if not small and not can_be_loops(eqn):
         raise Unsupported(f"`{name}` of a large array")
     like = tuple(jax.ShapeDtypeStruct(x.shape, _numpy_type(x)) for x in values)
     return self.closed(_program_of_factors(name, small, like, _Params(eqn.params)), values)
@@ -637,7 +637,7 @@ class _Params(dict):
 @functools.lru_cache(maxsize=256)
 def _program_of_factors(name: str, small: bool, like: Any, params: dict[str, Any]) -> Any:
     """The plain operations that compute factors; they are traced once for each shape."""
-    factors = in_plain_operations if small else factors_by_loops
+    factors = in_plain_operations if small else by_loops
     return jax.make_jaxpr(lambda *xs: factors(name, list(xs), params))(*like)
 
 

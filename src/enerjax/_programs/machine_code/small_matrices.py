@@ -5,6 +5,7 @@ operations, and it keeps the program around it from being one function.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -15,7 +16,7 @@ from ..._types import Count
 from .factors import Forms, of_each, outputs
 
 
-# The number of rows up to which matrices are small, and that of entries which are sorted.
+# The number of rows up to which matrices are small, and that of entries to sort.
 _MOST_ROWS, _MOST_SORTED = 16, 32
 
 
@@ -93,7 +94,7 @@ def _exchange(pivots: Int[Array, " w"], k: Count, rows: Int[Array, " m"]) -> Arr
 def _sorted(operands: list[Array]) -> list[Array]:
     """The operands in the order of the first, by the rank of each entry."""
     (keys, *_), count = operands, operands[0].shape[0]
-    before = _is_before(keys[:, None], keys[None])
+    before = is_before(keys[:, None], keys[None])
     numbers = jnp.arange(count)
     # Equal entries keep their order.
     first = before | (~before.T & (numbers[:, None] < numbers[None]))
@@ -102,7 +103,16 @@ def _sorted(operands: list[Array]) -> list[Array]:
     return [x.at[source].get(mode="promise_in_bounds") for x in operands]
 
 
-def _is_before(a: Array, b: Array) -> Bool[Array, "..."]:
+def sorted_along(
+    fn: Callable[[list[Array]], list[Array]], operands: list[Array], axis: int
+) -> list[Array]:
+    """The operands sorted along an axis, by a function for arrays of one axis."""
+    moved = [jnp.moveaxis(x, axis, -1) for x in operands]
+    out = of_each(lambda *xs: fn(list(xs)), 1, *moved)
+    return [jnp.moveaxis(x, -1, axis) for x in out]
+
+
+def is_before(a: Array, b: Array) -> Bool[Array, "..."]:
     """Whether `a` comes before `b`; NaN comes last."""
     if not jnp.issubdtype(a.dtype, jnp.inexact):
         return a < b
@@ -117,10 +127,7 @@ def in_plain_operations(
 ) -> list[Array]:
     """The outputs of one of `FACTORS`."""
     if name == "sort":
-        axis = params["dimension"]
-        moved = [jnp.moveaxis(x, axis, -1) for x in values]
-        out = of_each(lambda *xs: _sorted(list(xs)), 1, *moved)
-        return [jnp.moveaxis(x, -1, axis) for x in out]
+        return sorted_along(_sorted, values, params["dimension"])
     if name != "lu_pivots_to_permutation":
         return outputs(name, values, params, _FORMS)
     size = params["permutation_size"]
