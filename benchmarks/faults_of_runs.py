@@ -56,8 +56,8 @@ FAULTS = (
     Fault(
         "regularisation: a null space that stands still",
         "_solvers/root.py",
-        "change + _null_space_rate(exact, flat_fn, flat, (moved, fixed), t_args)",
-        "change",
+        "exact.refined(solve, -rate) + turned",
+        "exact.refined(solve, -rate) + 0 * turned",
         "Derivatives of multipliers of least norm miss how their null space rotates.",
         of("redundant::test_derivatives_of_forces_that_turn_against_each_other"),
     ),

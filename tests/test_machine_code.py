@@ -433,6 +433,7 @@ def test_factors_of_larger_matrices(rows):
     solve = jax.scipy.linalg.solve_triangular
     fn = lambda a, d, b: (
         jnp.linalg.solve(a, b),
+        *jax.lax.linalg.lu(a),
         jnp.linalg.cholesky(d),
         solve(d, b, lower=True),
         solve(d, b[:, 0], trans=1, unit_diagonal=True) / jnp.max(jnp.abs(d)) ** 9,

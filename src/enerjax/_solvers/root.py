@@ -69,8 +69,9 @@ def _root_jvp(primals, tangents):
     regularisation = flat_of(args[-1])
     exact = with_jacobian(flat_fn, flat, args, root_finder, regularisation, start, chord)
     if regularisation is not None:
-        change = exact.solve(flat, -rate)
-        change = change + _null_space_rate(exact, flat_fn, flat, (moved, fixed), t_args)
+        solve = exact.regularised_solver(flat)
+        turned = _null_space_rate(exact, solve, flat_fn, flat, (moved, fixed), t_args)
+        change = exact.refined(solve, -rate) + turned
     elif chord is not None and has_chord_search(root_finder):
         change = _change(exact, chord, root_finder, root.value, args, -rate)
     else:
@@ -104,6 +105,7 @@ def _change(
 
 def _null_space_rate(
     linear: Linearisable,
+    solve: Callable[[Array], Array],
     fn: Callable[[Array, PyTree], Array],
     root: Float[Array, " n"],
     moved_and_fixed: tuple[PyTree, PyTree],
@@ -114,7 +116,7 @@ def _null_space_rate(
     The null space rotates as the arguments change. The least-norm root stays orthogonal to
     it, so its tangent has a part in the null space. It is found from the roots `r` of
     `fn(r) + regularisation r = 0`, which tend to the least-norm root as the regularisation
-    tends to zero. `r` is one correction away from the root.
+    tends to zero. `r` is one correction away from the root, where `solve` solves.
     """
     moved, fixed = moved_and_fixed
 
@@ -123,7 +125,6 @@ def _null_space_rate(
         return fn(at, args) + ravel_pytree(args[-1])[0] * at
 
     assert linear.regularisation is not None
-    solve = linear.regularised_solver(root)
     regular = root - solve(linear.regularisation * root)
     _, rate = jax.jvp(lambda moved: regularised(moved, regular), (moved,), (t_args,))
     return linear.null_space_part(solve, linear.regularised_solver(regular)(-rate))

@@ -115,14 +115,16 @@ class Linearisable(eqx.Module):
         Where the Jacobian is singular and there is a `regularisation`, this is the solution
         that is orthogonal to the null space.
         """
-        solve = self.regularised_solver(x)
+        return self.refined(self.regularised_solver(x), right)
+
+    def refined(
+        self, solve: Callable[[Array], Array], right: Float[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """`solve(right)` without the error of first order in the regularisation."""
         first = solve(right)
-        # Removes the error of first order in the regularisation.
-        return (
-            first
-            if self.regularisation is None
-            else first + solve(self.regularisation * first)
-        )
+        if self.regularisation is None:
+            return first
+        return first + solve(self.regularisation * first)
 
     def null_space_part(
         self, solve: Callable[[Array], Array], x: Float[Array, " n"]
