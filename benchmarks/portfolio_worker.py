@@ -34,6 +34,8 @@ _PROJECT = Path(__file__).parents[1]
 _FINER = {"mujoco": 8, "exudyn": 10}
 # Lengths of the steps of difference quotients, relative to the numbers.
 _STEPS = (1e-4, 3e-5, 1e-5, 3e-6, 1e-6)
+# The relative difference from them above which a gradient is wrong. (They have round-off.)
+_OFF = 1e-6
 Record = dict[str, Any]
 # From a word of the input to microseconds.
 Timers = dict[str, Callable[[], float]]
@@ -223,7 +225,10 @@ def _disagreement(
         by_quotient = float(slope(lambda e: value(moved(e)), eps))
         off.append(abs(by_gradient / by_quotient - 1))
     # Long steps have an error of truncation, short ones one of round-off.
-    return min(off)
+    least = min(off, default=np.nan)
+    if not least < _OFF:
+        raise ValueError(f"off by {least:.0e} from difference quotients, or they fail")
+    return least
 
 
 # From `import` to the first result, as in a script of a user.
