@@ -8,7 +8,7 @@ FAULTS = (
     Fault(
         "band: no pivoting by hand",
         "_solvers/linear/dense.py",
-        "jnp.where(sizes == jnp.max(sizes), numbers, num_rows - 1)",
+        "jnp.where(sizes == most, numbers, num_rows - 1)",
         "jnp.where(sizes > 0, numbers, num_rows - 1)",
         "The elimination of narrow bands takes the first pivot that is not zero.",
         of("large_systems::test_a_band_is_cut_into_the_blocks_that_it_is_made_of"),
@@ -249,6 +249,22 @@ FAULTS = (
         "return shared(known[atom]) if uses[atom] > 1 else known[atom]",
         "return known[atom]",
         "An inner loop changes the carry of an outer one, which is read after it.",
+        of("machine_code::test_lanes_equal_single_calls"),
+    ),
+    Fault(
+        "machine code: a loop in a condition",
+        "_programs/machine_code/loops.py",
+        "carry = map(shared, cells.read(head))",
+        "carry = cells.read(head)",
+        "A loop in the condition of another one changes what the body of that one reads.",
+        of("machine_code::test_lanes_equal_single_calls"),
+    ),
+    Fault(
+        "machine code: a carry that stays",
+        "_programs/machine_code/loops.py",
+        "shared(value) if places is None else value",
+        "value",
+        "A loop changes cells that a loop before it reads later.",
         of("machine_code::test_lanes_equal_single_calls"),
     ),
     Fault(

@@ -63,6 +63,15 @@ def test_definite_matrices_need_no_pivots(size):
         np.testing.assert_allclose(x, y, rtol=0, atol=1e-10)
 
 
+@pytest.mark.parametrize("size", [2, 5, 12])
+def test_an_entry_that_is_no_number_leaves_no_number(size):
+    square = np.array(TURN.ravel()[: size * size] if size < 7 else np.eye(12).ravel())
+    for place in range(0, size * size, 3):
+        broken = square.copy()
+        broken[place] = np.nan
+        assert np.all(np.isnan(inverse(jnp.asarray(broken.reshape(size, size)))))
+
+
 def test_a_singular_matrix_has_no_inverse():
     old = Inverse(jnp.eye(2))
     assert not np.any(np.isfinite(old.renewed(jnp.ones((2, 2))).inverse))

@@ -446,6 +446,15 @@ def test_factors_of_larger_matrices(rows):
         np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-8 * np.max(np.abs(b)))
 
 
+def test_factors_of_an_infinite_matrix_are_rows_that_exist():
+    matrix = np.random.default_rng(1).normal(size=(40, 40))
+    matrix[3, 39] = np.inf
+    assert is_compiled(in_one_function(jax.lax.linalg.lu), matrix)
+    _, pivots, order = jax.jit(in_one_function(jax.lax.linalg.lu))(matrix)
+    assert np.all(pivots < 40)
+    np.testing.assert_array_equal(np.sort(order), np.arange(40))
+
+
 @pytest.mark.parametrize("length", [1000, 20000])
 def test_tables_that_are_looked_up(length):
     table = np.sin(np.linspace(0, 1, length))
@@ -665,6 +674,49 @@ def loops_in_loops(x, y):
     return [x.sum(axis=0) for x in out]
 
 
+def loops_in_conditions(x, y):
+    """A loop begins with the carry of the loop whose condition it is a part of."""
+    table = jnp.outer(jnp.linspace(0.1, 1, 20), x)
+    change = lambda c: (c[0] + 1, jnp.sin(1.3 * c[1]))
+    ahead = lambda z: jax.lax.while_loop(lambda c: c[0] < 3, change, (0, z))[1]
+    goes_on = lambda c: (c[0] < 4) & (jnp.max(ahead(c[1])) > 0.1 * y[0])
+    count, z = jax.lax.while_loop(
+        goes_on, lambda c: (c[0] + 1, 0.9 * c[1] - 0.01), (0, table)
+    )
+    doubled = lambda z: jax.lax.while_loop(lambda d: d < 5, lambda d: 2 * d, z)
+    single = jax.lax.while_loop(
+        lambda c: (doubled(c[0]) < 100) & (c[1] < 4),
+        lambda c: (c[0] + 1, c[1] + 1),
+        (y[1], 0),
+    )
+    return count, z.sum(axis=0), single
+
+
+def carries_that_stay(x, y):
+    """The tangent that an inner loop only reads is what another one begins with."""
+    table = jnp.outer(x, jnp.linspace(0.1, 1, 30)).ravel()
+
+    def turned(n, z):
+        change = lambda c: (c[0] + 1, jnp.sin(1.3 * c[1]) + y[0])
+        return jax.lax.while_loop(lambda c: c[0] < n, change, (0, z))[1]
+
+    def body(carry):
+        k, z, tangent = carry
+        total = 0.1 * turned(2, z).mean()
+
+        def inner(z):
+            change = lambda c: (c[0] + 1, c[1] + jnp.sin(c[2]) * total, c[2] + 1.0)
+            first = (0, jnp.full(z.shape, total), z)
+            return jax.lax.while_loop(lambda c: c[0] < 3, change, first)[1:]
+
+        (sums, _), (rates, stays) = jax.jvp(inner, (0.5 * table,), (tangent,))
+        return k + 1, 0.1 * sums + rates, turned(3, stays)
+
+    carry = 0, table, table[::-1]
+    _, *out = jax.lax.while_loop(lambda c: c[0] < 4, body, carry)
+    return [jnp.sum(z.reshape(3, -1), axis=1) for z in out]
+
+
 def rows_after_the_first(x, y):
     """The cell before the rows belongs to a number that all lanes may share."""
 
@@ -695,6 +747,8 @@ OF_LANES = [
     factors_of_lanes,
     long_rows,
     loops_in_loops,
+    loops_in_conditions,
+    carries_that_stay,
     rows_after_the_first,
 ]
 

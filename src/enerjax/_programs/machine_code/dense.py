@@ -55,15 +55,20 @@ def _entry(x: Array, k: Count) -> Array:
 
 
 def _factored(
-    panel: Float[Array, "m w"], rows: _Rows, first: Count
+    panel: Float[Array, "m w"], rows: _Rows, first: Count, size: int
 ) -> tuple[tuple[Float[Array, "m w"], _Rows], Int[Array, " w"]]:
-    """The columns of the factors from a first one on, and the pivot of each."""
+    """The columns of the factors from a first one on, and the pivot of each.
+
+    Rows from `size` on are the pivots of no other columns than those from `size` on.
+    """
     columns = jnp.arange(panel.shape[1], dtype=jnp.int32)
+    fills = jnp.arange(len(panel), dtype=jnp.int32) >= size
 
     def turn(carry: tuple[Array, _Rows], k: Count) -> tuple[tuple[Array, _Rows], Count]:
         panel, rows = carry
         column, at = _column(panel, k), first + k
-        sizes = jnp.where(rows.place >= at, jnp.abs(column), -1.0)
+        is_left = (rows.place >= at) & (~fills | (at >= size))
+        sizes = jnp.where(is_left, jnp.abs(column), -1.0)
         chosen = jnp.argmax(sizes).astype(jnp.int32)
         pivot, rows = _entry(rows.place, chosen), rows.exchanged(chosen, at)
         row = _row(panel, chosen)
@@ -83,11 +88,11 @@ def _lu(
     matrix: Float[Array, "m n"],
 ) -> tuple[Float[Array, "m n"], Int[Array, " k"], Int[Array, " m"]]:
     """The factors, the pivot of each column, and the order of the rows."""
-    numbers = jnp.arange(matrix.shape[0], dtype=jnp.int32)
-    rows, first = _Rows(numbers, numbers), jnp.zeros((), jnp.int32)
     if matrix.shape[0] == matrix.shape[1] > 2 * _BLOCK:
         return _lu_by_blocks(matrix)
-    (matrix, rows), pivots = _factored(matrix, rows, first)
+    numbers = jnp.arange(matrix.shape[0], dtype=jnp.int32)
+    rows, first = _Rows(numbers, numbers), jnp.zeros((), jnp.int32)
+    (matrix, rows), pivots = _factored(matrix, rows, first, len(matrix))
     return matrix.at[rows.order].get(mode="promise_in_bounds"), pivots, rows.order
 
 
@@ -107,7 +112,7 @@ def _lu_by_blocks(
     ) -> tuple[tuple[Array, _Rows], Array]:
         matrix, rows = carry
         own = jax.lax.dynamic_slice_in_dim(matrix, first, _BLOCK, 1)
-        (own, rows), pivots = _factored(own, rows, first)
+        (own, rows), pivots = _factored(own, rows, first, size)
         chosen = jax.lax.dynamic_slice_in_dim(rows.order, first, _BLOCK)
         taken = lambda x: x.at[chosen].get(mode="promise_in_bounds")
         is_after = (numbers >= first + _BLOCK)[None]
@@ -119,8 +124,8 @@ def _lu_by_blocks(
         left = jnp.where(place == np.arange(_BLOCK, dtype=np.int32)[None], 1, left)
         kept = jnp.where(is_new & is_after, 0, matrix)
         is_own = (numbers >= first)[None] & ~is_after
-        same = own[:, np.arange(size + more) % _BLOCK]
-        return (jnp.where(is_own, same, kept + left @ upper), rows), pivots
+        repeated = own[:, np.arange(size + more) % _BLOCK]
+        return (jnp.where(is_own, repeated, kept + left @ upper), rows), pivots
 
     carry = matrix, _Rows(numbers, numbers)
     firsts = _BLOCK * jnp.arange(len(matrix) // _BLOCK, dtype=jnp.int32)

@@ -95,11 +95,14 @@ class Branch:
 def _finish(
     self: "Evaluation", item: Any, extra: Sequence[Node] = (), least: int = 0
 ) -> None:
-    """Puts an item into the current region, after all that it reads, at `least` there."""
+    """Puts an item into the current region, after all that it reads.
+
+    Its level is `least` or more.
+    """
     region = self.graph.current
     item.level = max(
         (x.level for x in [*_read_from(region, item), *extra] if x.region is region),
-        default=least,
+        default=0,
     )
     item.level = max(item.level, least)
     region.items.append(item)
@@ -269,9 +272,8 @@ def _same_through(jaxpr: Any, count: int, first: int, offset: int = 0) -> list[b
 class _Carry:
     """The cells of a carry.
 
-    Those of a loop in the body of another loop can be those of the carry of that loop,
-    whose values it changes: only a loop that changes no cells of passes that have ended
-    `takes_over` cells.
+    A loop in the body of another loop can take over the cells of the carry of that loop.
+    Only a `while` does: a scan writes in lanes that have ended, too.
     """
 
     def __init__(
@@ -355,8 +357,16 @@ class _Carry:
         return write
 
     def end(self, level: int) -> list[Value]:
-        """The values after the loop, which other loops can change in their cells."""
-        return self._in_cells(self.evaluation.graph.current, level + 1)
+        """The values after the loop, which other loops can change in their cells.
+
+        A value that stays may have been read by this loop, which need not have run yet
+        when another loop does.
+        """
+        values = self._in_cells(self.evaluation.graph.current, level + 1)
+        return [
+            shared(value) if places is None else value
+            for value, places in zip(values, self.places, strict=True)
+        ]
 
     def _in_cells(self, region: Region, ready: int) -> list[Value]:
         owners = [x for own in self.owners for x in own]
@@ -546,6 +556,7 @@ def _row(self: "Evaluation", x: Value, counter: Node) -> Value:
 
 
 def _written_out(self, closed, consts, carry, rows, length, reverse) -> list[Value]:
+    # Every pass reads the constants.
     count, stacked, consts = len(carry), [], [*map(shared, consts)]
     for k in range(length)[:: -1 if reverse else 1]:
         own = [
@@ -582,7 +593,9 @@ def _while(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
     cells = _Carry(self, carry, same, takes_over=True)
     written = cells.begin()
     with _within(self, head):
-        (goes_on,) = self.closed(params["cond_jaxpr"], [*outer, *cells.read(head)])
+        # Loops in the condition must not change what the body reads.
+        carry = map(shared, cells.read(head))
+        (goes_on,) = self.closed(params["cond_jaxpr"], [*outer, *carry])
         (flag,) = self.cellar.unlaned(goes_on).ravel()
         self.cellar.hand_over([owner], head, 0)
         # Where several passes are made at a time, one that has ended does not begin again.

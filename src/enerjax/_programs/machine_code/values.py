@@ -66,12 +66,12 @@ class Memory:
 
 
 class Carried(Memory):
-    """The cells of a carry in the body of its loop, where no other operation reads them.
+    """The cells of a carry, which one other loop may take over.
 
-    A loop in the body may have its own carry there.
+    It must not be held in two places: a value with several readers is `shared`.
 
     - `owners`: who owns the cells.
-    - `region`: the body.
+    - `region`: where that loop may be.
     """
 
     def __init__(

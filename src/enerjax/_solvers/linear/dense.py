@@ -74,13 +74,15 @@ def eliminated(
         table, place, order = carry
         entries = jax.lax.dynamic_index_in_dim(table, k, 1, keepdims=False)
         sizes = jnp.where(place >= k, jnp.abs(entries), -1)
-        # The first of the largest entries. Two reductions cost less than `argmax`. (If an
-        # entry is NaN, all entries become NaN.)
-        pivot = jnp.min(jnp.where(sizes == jnp.max(sizes), numbers, num_rows - 1))
+        # The first of the largest entries. Two reductions cost less than `argmax`.
+        most = jnp.max(sizes)
+        pivot = jnp.min(jnp.where(sizes == most, numbers, num_rows - 1))
         row, entry, before, first = (
             jax.lax.dynamic_index_in_dim(x, at, keepdims=False)
             for x, at in ((table, pivot), (entries, pivot), (place, pivot), (order, k))
         )
+        # If an entry is NaN, the whole table becomes NaN.
+        entry = jnp.where(jnp.isnan(most), jnp.nan, entry)
         chosen = numbers == pivot
         place = jnp.where(chosen, k, jnp.where(numbers == first, before, place))
         order = jnp.where(numbers == k, pivot, jnp.where(numbers == before, first, order))
