@@ -183,7 +183,7 @@ class LU(AbstractFactors):
     def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
         # Transposed, entries at computed places would be updates of such places, which a
         # function of machine code has only few of.
-        is_at = self.permutation[:, None] == np.arange(right.size)
+        is_at = self.permutation[:, None] == np.arange(right.size)[None]
         column = jnp.sum(jnp.where(is_at, right[None], 0), axis=1)[:, None]
         column = jax.lax.linalg.triangular_solve(
             self.factors, column, left_side=True, lower=True, unit_diagonal=True
