@@ -18,10 +18,8 @@ _LONGEST, _LONGEST_OF_LANES, _FEW_LANES = 2_500, 300, 256
 # Branches of more operations are compiled when one is first taken. Most runs never need
 # Newton's method or a division of a step, which are more than half of their program.
 _LARGE_BRANCH = 1_000
-
-
-# The longest chain of operations that is moved for the last of them.
-_SUNK_WITH_IT = 8
+# The longest chain of operations that moves to a later kernel with the last of them.
+_LONGEST_SUNK = 8
 
 
 class Emission:
@@ -400,8 +398,8 @@ def _sink(live: set[Node]) -> None:
         own = users.get(x, [])
         if any(y.region is not x.region or y.lanes != x.lanes for y in own):
             continue
-        # What is written to the cells of a carry is computed before, from those cells.
+        # At the level where a carry is written, it could be read after it was written.
         level = min((y.level for y in own if y.op != "store"), default=x.level)
         is_written = any(y.op == "store" for y in own)
-        if level > x.level and not is_written and can_move(x, _SUNK_WITH_IT):
+        if level > x.level and not is_written and can_move(x, _LONGEST_SUNK):
             x.level = level

@@ -17,8 +17,8 @@ from .values import (
     Block,
     Carried,
     Cells,
-    CONSTANTS,
     dtype_of,
+    has_constants_among_others,
     Memory,
     MOST_CELLS,
     objects,
@@ -512,8 +512,7 @@ def _rows_in_order(self: "Evaluation", x: Value) -> Value:
     places = self.cellar.of_one_memory(memory.places, memory.dtype)
     flat = places.reshape(len(places), -1)
     steps = np.diff(flat, axis=0)
-    # Constants are far from other cells, but not by the distance of their numbers.
-    is_mixed = np.any(places >= CONSTANTS) and np.any(places < CONSTANTS)
+    is_mixed = has_constants_among_others(places)
     if steps.size == 0 or (np.all(steps == steps[0, 0]) and not is_mixed):
         return Memory(memory.dtype, places)
     return self.cellar.contiguous(memory)

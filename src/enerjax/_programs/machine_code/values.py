@@ -504,30 +504,27 @@ class Cellar:
         return region
 
 
+def has_constants_among_others(places: np.ndarray) -> bool:
+    """Whether some cells hold constants and others do not.
+
+    Constants are far from other cells, but not by the distance of their numbers.
+    """
+    return bool(np.any(places >= CONSTANTS) and np.any(places < CONSTANTS))
+
+
 def strides_of(places: np.ndarray) -> list[int] | None:
     """The distance between neighbours along each axis, where it is everywhere the same."""
     if places.size == 0:
         return [0] * places.ndim
-    # Constants are far from other cells, but not by the distance of their numbers.
-    if np.any(places >= CONSTANTS) and np.any(places < CONSTANTS):
+    if has_constants_among_others(places):
         return None
-    first = places.ravel()[0]
-    strides = [
-        int(places.take(1, axis).ravel()[0] - first) if n > 1 else 0
-        for axis, n in enumerate(places.shape)
-    ]
-    regular = first + sum(
-        (
-            stride * k
-            for stride, k in zip(
-                strides, np.indices(places.shape, sparse=True), strict=True
-            )
-        ),
-        0,
-    )
-    return (
-        strides if np.array_equal(np.broadcast_to(regular, places.shape), places) else None
-    )
+    strides = []
+    for axis in range(places.ndim):
+        steps = np.diff(places, axis=axis)
+        strides.append(int(steps.ravel()[0]) if steps.size else 0)
+        if np.any(steps != strides[-1]):
+            return None
+    return strides
 
 
 def lane_of(values: list[Value], shape: tuple[int, ...]) -> int | None:
