@@ -28,6 +28,7 @@ def _column(x: Array, k: Count) -> Array:
 
 
 def _row(x: Array, k: Count) -> Array:
+    """A row of a matrix, or an entry of a vector."""
     return jax.lax.dynamic_index_in_dim(x, k, axis=0, keepdims=False)
 
 
@@ -43,15 +44,11 @@ class _Rows(NamedTuple):
     def exchanged(self, chosen: Count, k: Count) -> "_Rows":
         """With the chosen row at the place `k`."""
         place, order = self
-        before, first = (_entry(x, i) for x, i in ((place, chosen), (order, k)))
+        before, first = (_row(x, i) for x, i in ((place, chosen), (order, k)))
         numbers = jnp.arange(place.size, dtype=place.dtype)
         place = jnp.where(numbers == chosen, k, jnp.where(numbers == first, before, place))
         order = jnp.where(numbers == k, chosen, jnp.where(numbers == before, first, order))
         return _Rows(place, order)
-
-
-def _entry(x: Array, k: Count) -> Array:
-    return jax.lax.dynamic_index_in_dim(x, k, keepdims=False)
 
 
 def _factored(
@@ -70,7 +67,7 @@ def _factored(
         is_left = (rows.place >= at) & (~fills | (at >= size))
         sizes = jnp.where(is_left, jnp.abs(column), -1.0)
         chosen = jnp.argmax(sizes).astype(jnp.int32)
-        pivot, rows = _entry(rows.place, chosen), rows.exchanged(chosen, at)
+        pivot, rows = _row(rows.place, chosen), rows.exchanged(chosen, at)
         row = _row(panel, chosen)
         divisor = row[k]
         # A column of zeros is left as it is, as by LAPACK.
@@ -169,14 +166,13 @@ def _sorted(operands: list[Array]) -> list[Array]:
     numbers = jnp.arange(keys.size)
 
     def add(k: Count, ranks: Array) -> Array:
-        key = jax.lax.dynamic_index_in_dim(keys, k, keepdims=False)
+        key = _row(keys, k)
         # Equal entries keep their order.
         first = is_before(key, keys) | (~is_before(keys, key) & (k < numbers))
         return ranks + first.astype(ranks.dtype)
 
     def put(k: Count, source: Array) -> Array:
-        rank = jax.lax.dynamic_index_in_dim(ranks, k, keepdims=False)
-        return jnp.where(numbers == rank, k, source)
+        return jnp.where(numbers == _row(ranks, k), k, source)
 
     ranks = jax.lax.fori_loop(0, keys.size, add, jnp.zeros_like(numbers))
     source = jax.lax.fori_loop(0, keys.size, put, jnp.zeros_like(numbers))

@@ -100,11 +100,8 @@ def _finish(
     Its level is `least` or more.
     """
     region = self.graph.current
-    item.level = max(
-        (x.level for x in [*_read_from(region, item), *extra] if x.region is region),
-        default=0,
-    )
-    item.level = max(item.level, least)
+    read = (x for x in [*_read_from(region, item), *extra] if x.region is region)
+    item.level = max([least, *(x.level for x in read)])
     region.items.append(item)
 
 

@@ -181,8 +181,8 @@ class LU(AbstractFactors):
         return LU(factors, permutation.astype(self.permutation.dtype))
 
     def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
-        # Transposed, entries at computed places would be updates of such places, which a
-        # function of machine code has only few of.
+        # A lookup by the permutation would be a scatter when it is transposed, and
+        # functions of machine code have no large scatters to computed places.
         is_at = self.permutation[:, None] == np.arange(right.size)[None]
         column = jnp.sum(jnp.where(is_at, right[None], 0), axis=1)[:, None]
         column = jax.lax.linalg.triangular_solve(
