@@ -33,6 +33,8 @@ _UNDAMPED_PATIENCE = 20
 # directions whose stiffness has decreased since it was evaluated, and the motion of a light
 # body beside a heavy one is not resolved until the Jacobian is exact.
 _SHRINKS = 0.3
+# A Jacobian that has decreased a correction by this factor is accurate.
+_SHRINKS_FAST = 0.1
 # Where coordinates lie far from the origin, a search ends after this many corrections in a
 # row that do not decrease.
 _STALLS = 4
@@ -48,7 +50,8 @@ class Powers(NamedTuple):
     - `small`: a correction or a residual below this is in the range of convergence.
     - `moderate`: a residual above this is not round-off, however far from the origin the
       coordinates lie.
-    - `tiny`: a residual below this is round-off if a new Jacobian does not reduce it.
+    - `tiny`: a residual below this is round-off if a new Jacobian does not reduce it, or if
+      an accurate one no longer does.
     - `round_off`: a residual below this is round-off if a Jacobian that has reduced it
       before no longer does. The largest residual of a long chain or beam is larger: forces
       are handed on from body to body, and their rounding errors with them.
@@ -112,6 +115,7 @@ class _Iterate(eqx.Module):
       first correction.
     - `contraction`: `size` divided by the size of the correction before, if both were
       computed with the same Jacobian, else zero.
+    - `accurate`: whether the current Jacobian has decreased a correction fast.
     - `corrections`, `jacobians`: the number of corrections and of Jacobians so far.
     - `stalls`: the number of consecutive new Jacobians whose correction was small and not
       smaller than the correction before.
@@ -127,6 +131,7 @@ class _Iterate(eqx.Module):
     fraction: Scalar
     size: Scalar
     contraction: Scalar
+    accurate: Flag
     corrections: Count
     jacobians: Count
     stalls: Count
@@ -174,6 +179,7 @@ def _first_iterate(
         fraction=one,
         size=infinite,
         contraction=zero,
+        accurate=no,
         corrections=corrections,
         jacobians=none,
         stalls=none,
@@ -296,7 +302,12 @@ def _classify(
     is_root = (defect <= newton.atol * powers.eps) & small
     # Corrections with one Jacobian that have decreased and stop decreasing are round-off.
     met = ~fresh & ~shrinks & (iterate.contraction > 0)
-    met = met & (defect <= powers.round_off) & small
+    # So are larger ones, such as those of stiff forces, if the Jacobian has been accurate.
+    # The motion of a light body can converge slowly after that of a heavy one has
+    # converged, so the correction must be tiny too.
+    fell_fast = iterate.accurate & (size <= powers.tiny)
+    bound = jnp.where(fell_fast, powers.tiny, powers.round_off)
+    met = met & (defect <= bound) & small
     # A small correction with a new Jacobian that is not smaller than the one before is
     # round-off too, if the residual is tiny. It is larger where coordinates lie a million
     # lengths from the origin. It then must not decrease several times in a row, and must
@@ -337,6 +348,7 @@ def _next_iterate(
         fraction=fraction,
         size=jnp.where(taken, correction.size, iterate.size),
         contraction=jnp.where(fresh | halves, 0, correction.contraction),
+        accurate=~fresh & (iterate.accurate | (correction.contraction < _SHRINKS_FAST)),
         corrections=iterate.corrections + changes,
         jacobians=iterate.jacobians,
         stalls=verdict.stalls,
