@@ -391,8 +391,8 @@ FAULTS = (
     Fault(
         "prediction: extrapolation where it is worse",
         "_run/prediction.py",
-        "is_smooth=error(smooth) <= error(last)",
-        "is_smooth=error(smooth) >= error(last)",
+        "jnp.where(each <= least,",
+        "jnp.where(each >= least,",
         "Steps begin from the worse of two guesses.",
         of(
             "step::test_the_memory_of_earlier_steps_saves_iterations_and_changes_no_result",

@@ -73,16 +73,15 @@ def roughness(
     """The norms of the second and third differences of the velocities of the last steps.
 
     They are computed from `added` and `before`: the differences between the unknowns and
-    their values without forces, for this step and for the three steps before. `inertia` is
-    the scale `step` of `Scales`. Returns the
-    norm of the second difference and that of the third (square root of an energy), and the
-    norm of the second difference in the scales `unit` of the unknowns. They have zero
-    derivatives.
+    their values without forces, for this step and for three or more steps before.
+    `inertia` is the scale `step` of `Scales`. Returns the norm of the second difference
+    and that of the third (square root of an energy), and the norm of the second difference
+    in the scales `unit` of the unknowns. They have zero derivatives.
     """
     is_increment = lambda x: isinstance(x, Increment)
     leaves = lambda z: jax.tree.leaves(z, is_leaf=is_increment)
     ends = lambda z: list(filter(is_increment, leaves(z)))[-1].rate
-    rates = jnp.concatenate([ends(added)[None], ends(before)])
+    rates = jnp.concatenate([ends(added)[None], ends(before)[:3]])
     new, old = jnp.diff(rates, n=2, axis=0)
     size = lambda x: jnp.linalg.norm(x * inertia)
     # The larger of two successive differences, because one of them can pass through zero.

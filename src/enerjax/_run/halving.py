@@ -232,7 +232,7 @@ def _memory_of_parts(step: _Step, count: Scalar, chord_wait: Count | None) -> Me
     return Memory(
         # What a step adds to a free flight is proportional to its length.
         added=jax.tree.map(lambda x: x / count, memory.added),
-        is_smooth=jnp.array(False),
+        choice=jnp.array(0),
         factors=memory.factors,
         chord_wait=chord_wait,
         carried=memory.carried,
@@ -247,7 +247,7 @@ def _with_memory_after(step: _Step, done: Solved, count: Scalar) -> Solved:
     else:
         memory = Memory(
             added=jax.tree.map(lambda x: count * x, last.added),
-            is_smooth=jnp.array(False),
+            choice=jnp.array(0),
             factors=last.factors,
             chord_wait=step.memory.chord_wait,
             carried=last.carried,

@@ -1,5 +1,7 @@
 """The initial guesses of Newton's method, extrapolated from the last steps."""
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -9,9 +11,13 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._solvers import AbstractFactors, max_norm, Root
-from .._types import Count, Flag, Scalar
+from .._types import Count, Scalar
 
 
+# The numbers of steps from which the candidates for a prediction are extrapolated.
+_CANDIDATES = (1, 3, 5)
+# The number of steps whose unknowns are kept.
+NUM_KEPT = max(_CANDIDATES)
 # The number of steps without the chord method after it has failed. The causes of a failure
 # (stiff forces, fast rotations) usually last for several steps, and each attempt costs a
 # few evaluations of the residual.
@@ -21,10 +27,9 @@ _CHORD_WAITS = 10
 class Memory(eqx.Module):
     """The data of the last steps that a solve uses.
 
-    - `added`: the unknowns of the last three steps minus those of a free flight, newest
+    - `added`: the unknowns of the last five steps minus those of a free flight, newest
       first.
-    - `is_smooth`: whether the extrapolation of `added` was a better guess for the last step
-      than the step before it.
+    - `choice`: the number of the candidate that would have predicted the last step best.
     - `factors`: the factors of the Jacobians of the last three steps, newest first; `None`
       for large systems, and where the chord method is used.
     - `chord_wait`: the number of steps until the chord method is tried again; `None` where
@@ -34,29 +39,50 @@ class Memory(eqx.Module):
     """
 
     added: PyTree[Any]
-    is_smooth: Flag
+    choice: Count
     factors: AbstractFactors | None
     chord_wait: Count | None
     carried: PyTree[Any]
 
 
+def initial_memory(
+    added: PyTree[Any],
+    factors: AbstractFactors | None,
+    chord_wait: Count | None,
+    carried: PyTree[Any],
+) -> Memory:
+    """The memory before the first step, which is predicted to add `added`."""
+    repeated = lambda tree, count: jax.tree.map(lambda x: jnp.stack([x] * count), tree)
+    return Memory(
+        added=jax.lax.stop_gradient(repeated(added, NUM_KEPT)),
+        choice=jnp.array(0),
+        factors=repeated(factors, 3),
+        chord_wait=chord_wait,
+        carried=carried,
+    )
+
+
 def predicted(memory: Memory) -> PyTree[Any]:
     """The predicted difference between the unknowns of a step and those of a free flight.
 
-    For a smooth motion this is an extrapolation of the last three steps, and for one that
-    changes quickly it is the difference of the last step. The choice is the one that would
-    have been better for the last step. An extrapolation of four steps needs fewer
-    corrections in short steps, but more searches fail in long ones.
+    For a motion that changes quickly it is the difference of the last step. For a smooth
+    one it is the quadratic extrapolation of the last three steps, and for short steps that
+    of degree four. The candidate is chosen that would have been best for the last step.
     """
-    smooth, last = _candidates(memory)
-    choose = lambda x, y: jnp.where(memory.is_smooth, x, y)
-    return jax.tree.map(choose, smooth, last)
+    candidates = _candidates(memory)
+
+    def chosen(*xs: Array) -> Array:
+        x = xs[0]
+        for k, other in enumerate(xs[1:], 1):
+            x = jnp.where(memory.choice == k, other, x)
+        return x
+
+    return jax.tree.map(chosen, *candidates)
 
 
-def _candidates(memory: Memory) -> tuple[PyTree[Any], PyTree[Any]]:
-    """The two predictions: the extrapolation, and the difference of the last step."""
-    smooth = jax.tree.map(extrapolated, memory.added)
-    return smooth, jax.tree.map(lambda x: x[0], memory.added)
+def _candidates(memory: Memory) -> tuple[PyTree[Any], ...]:
+    of = lambda count: lambda x: extrapolated(x[:count])
+    return tuple(jax.tree.map(of(count), memory.added) for count in _CANDIDATES)
 
 
 def memory_after(
@@ -72,14 +98,18 @@ def memory_after(
         difference = lambda x, y, unit: (x - y) / unit
         return max_norm(jax.tree.map(difference, added, guess, unknown_scale))
 
-    smooth, last = _candidates(memory)
+    errors = [error(guess) for guess in _candidates(memory)]
+    least, choice = errors[0], jnp.zeros_like(memory.choice)
+    for k, each in enumerate(errors[1:], 1):
+        choice = jnp.where(each <= least, jnp.asarray(k, choice.dtype), choice)
+        least = jnp.minimum(each, least)
     # A search by the chord method alone has no factors; those of earlier steps are kept.
     factors = memory.factors
     if root.factors is not None:
         factors = jax.tree.map(_shifted, root.factors, memory.factors)
     return Memory(
         added=jax.tree.map(_shifted, added, memory.added),
-        is_smooth=error(smooth) <= error(last),
+        choice=choice,
         factors=factors,
         chord_wait=_wait_after(memory.chord_wait, root),
         carried=carried,
@@ -93,14 +123,16 @@ def _wait_after(wait: Count | None, root: Root) -> Count | None:
     return jnp.where(wait == 0, passed, wait - 1).astype(wait.dtype)
 
 
-def extrapolated(x: Array) -> Array:
-    """The quadratic extrapolation of the last three values, which are newest first."""
-    return 3 * x[0] - 3 * x[1] + x[2]
+def extrapolated(x: Array | Sequence[Array]) -> Array:
+    """The value after equidistant values, newest first, by the polynomial through them."""
+    count = len(x)
+    terms = [(-1) ** k * math.comb(count, k + 1) * x[k] for k in range(count)]
+    return sum(terms[1:], terms[0])
 
 
 def _shifted(new: Array, old: Array) -> Array:
-    """The last three values after a step with the value `new`."""
-    return jnp.stack([new, old[0], old[1]])
+    """The last values after a step with the value `new`, as many as before."""
+    return jnp.concatenate([new[None], old[:-1]])
 
 
 def for_length(
@@ -111,8 +143,8 @@ def for_length(
 
     What a step adds to a free flight is proportional to its length, so their quotient is
     extrapolated quadratically from the midpoints of the three steps. `solve` extrapolates
-    `3 x0 - 3 x1 + x2`, or repeats `x0`: the entries are chosen such that it finds the
-    extrapolated value, or the last one.
+    steps of equal lengths: the entries are chosen such that it finds this value, or the
+    last one.
     """
     ends = np.cumsum(stages)
     # The midpoint of a backward stage may lie outside of the step, hence the clipping.
@@ -131,8 +163,10 @@ def for_length(
         shaped = lambda w: w.reshape(-1, *[1] * (x.ndim - 2))
         rates = x[:, 0] / a, x[:, 1] / b, x[:, 2] / c
         smooth = sum(shaped(w) * rate for w, rate in zip(weights, rates, strict=True))
-        last = length * rates[0]
-        return jnp.stack([last, last, length * smooth], axis=1)
+        # A parabola through the last value and, after it, the extrapolated one.
+        last, rise = length * rates[0], length * (smooth - rates[0])
+        values = [last + 0.5 * k * (k - 1) * rise for k in range(NUM_KEPT)]
+        return jnp.stack(values, axis=1)
 
     added = jax.tree.map(resampled, memory.added)
     return eqx.tree_at(lambda memory: memory.added, memory, added)
@@ -140,6 +174,6 @@ def for_length(
 
 def with_history(new: Memory, old: Memory) -> Memory:
     """The last step of the stacked memory `new`, and before it the steps of `old`."""
-    join = lambda x, y: jnp.concatenate([x[:, :1], y[:, :2]], axis=1)
+    join = lambda x, y: jnp.concatenate([x[:, :1], y[:, :-1]], axis=1)
     added = jax.tree.map(join, new.added, old.added)
     return eqx.tree_at(lambda memory: memory.added, new, added)

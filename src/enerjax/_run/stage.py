@@ -36,7 +36,7 @@ from ..schemes import (
     AbstractSchemeWithMemory,
     StepEnd,
 )
-from .prediction import extrapolated, Memory, memory_after, predicted
+from .prediction import extrapolated, initial_memory, Memory, memory_after, predicted
 
 
 # Enough for the linear convergence of a step that locks. A step that needs more has failed.
@@ -91,18 +91,11 @@ def first_memory(
     problem = step_problem(scheme, model, start, h, carried)
     z = scheme.predict(problem, acceleration, multipliers)
     flight = free_flight(scheme, problem, model, start)
-    added = jax.tree.map(lambda x, x0: jnp.stack([x - x0] * 3), z, flight)
-    added = jax.lax.stop_gradient(added)
+    added = jax.tree.map(jnp.subtract, z, flight)
     flat, _ = ravel_pytree(flight)
     both = flat.size > _FEW and has_chord(scheme, model)
     factors = None if both else kept_factors(flat.size, flat.dtype)
-    return Memory(
-        added=added,
-        is_smooth=jnp.array(True),
-        factors=jax.tree.map(lambda x: jnp.stack([x] * 3), factors),
-        chord_wait=jnp.array(0) if both else None,
-        carried=carried,
-    )
+    return initial_memory(added, factors, jnp.array(0) if both else None, carried)
 
 
 def step_problem(

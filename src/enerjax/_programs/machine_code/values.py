@@ -294,7 +294,7 @@ class Cellar:
 
         All are read at once, and those of the ends are replaced.
         """
-        if places.size < 8 or not np.all(np.diff(places[1:-1]) == 1):
+        if places.size < _FEWEST_LANES or not np.all(np.diff(places[1:-1]) == 1):
             return None
         inner = places[1:-1]
         whole = np.arange(inner[0] - 1, inner[-1] + 2)
