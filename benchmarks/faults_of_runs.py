@@ -268,6 +268,22 @@ FAULTS = (
         of("machine_code::test_lanes_equal_single_calls"),
     ),
     Fault(
+        "machine code: what is copied before a loop",
+        "_programs/machine_code/scheduling.py",
+        "        level = x.level if region is x.region else 0\n",
+        "        level = 0\n",
+        "Cells are copied before they are written.",
+        of("machine_code::test_loops_that_are_written_as_loops"),
+    ),
+    Fault(
+        "machine code: angles near multiples of a right angle",
+        "_programs/machine_code/trigonometry.py",
+        "    rest = b.fma(count, least, rest)\n",
+        "",
+        "Sines near zero have rounding errors of many units.",
+        of("machine_code::test_sine_cosine_and_arctangent"),
+    ),
+    Fault(
         "machine code: which branch is compiled",
         "_programs/machine_code/emission.py",
         "        number = len(self.late)\n",

@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import functools
+import math
 import time
 
 import jax
@@ -11,7 +12,7 @@ import pytest
 from jax.ad_checkpoint import checkpoint_name
 
 from enerjax._programs import at_places, in_one_function, why_not_one_function
-from enerjax._programs.machine_code import emission, library, loops
+from enerjax._programs.machine_code import emission, graph, library, loops, scheduling
 from enerjax._solvers.linear.dense import Inverse
 
 from .helpers import EPS, long
@@ -557,19 +558,93 @@ def turned_tables(x):
     return jax.lax.fori_loop(0, 9, turn, table)
 
 
+def scattered_entries(x):
+    """Loops that read entries far apart, of what they change and of what they do not."""
+    table = jnp.outer(jnp.arange(1.0, 13), jnp.linspace(0.5, 1, 9)) * x[0, 0]
+    places = np.array([7, 2, 11, 0, 5, 9, 9, 3])
+
+    def inner(k, row):
+        # The table changes around this loop, `x` and the constants do not.
+        fixed = table_before[places, 3] + x.ravel()[places % x.size] + 0.1 * places
+        row = jnp.where(k > 2, jnp.sin(row[places % 8] + fixed), row - fixed)
+        return jax.lax.cond(row[0] > 0, lambda: row * table_before[:8, 1], lambda: row)
+
+    def outer(k, carry):
+        nonlocal table_before
+        table, row = carry
+        table_before = table + jnp.sin(table) * jnp.sum(row)
+        row = jax.lax.fori_loop(0, k + 1, inner, row)
+        table = jnp.cos(table + row[places[:3]].sum()).at[:8, 2].set(row)
+        # Read by several operations in one pass.
+        return table, row + table[places, 4] * jnp.cumsum(table[places, 4])
+
+    table_before = table
+    return jax.lax.fori_loop(0, 5, outer, (table, jnp.ones(8)))
+
+
 @pytest.mark.parametrize(
     "fn",
-    [loops_over_the_same, large_carry, backwards, turned_tables],
+    [loops_over_the_same, large_carry, backwards, turned_tables, scattered_entries],
     ids=lambda fn: fn.__name__,
 )
 def test_loops_that_are_written_as_loops(fn, monkeypatch):
     monkeypatch.setattr(loops, "_WRITTEN_OUT", 0)
     # So that kernels are divided.
-    monkeypatch.setattr(emission, "_LONGEST", 300)
+    monkeypatch.setattr(scheduling, "LONGEST", 300)
     assert is_compiled(in_one_function(fn), X)
     found, expected = jax.jit(in_one_function(fn))(X), jax.jit(fn)(X)
     close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-13)
     jax.tree.map(close, found, expected)
+
+
+def test_loops_do_not_gather_what_they_do_not_change():
+    table, places = jnp.arange(60.0).reshape(10, 6), np.array([7, 2, 9, 0, 5])
+
+    def fn(table):
+        step = lambda k, row: jnp.sin(row * k + table[:5, 3]) * table[places, 1]
+        return jax.lax.fori_loop(0, 20, step, table[:5, 0])
+
+    closed = jax.make_jaxpr(fn)(table)
+    known = [*map(np.asarray, closed.consts), None]
+    cellar, _, _ = library.graph_of(closed.jaxpr, known)
+    regions = list(scheduling.all_regions(cellar.graph.root))
+    kernels = scheduling.kernels_of(cellar.graph, regions)
+    gathers = [
+        region.depth
+        for (region, *_), nodes in kernels.items()
+        for node in nodes
+        if any(is_gather(x) for x in node.operands)
+    ]
+    assert gathers
+    assert not any(gathers)
+
+
+def is_gather(x):
+    """Whether a number of lanes is read from cells that are not neighbours."""
+    is_read = isinstance(x, graph.Node) and x.op == "load" and x.lanes
+    return bool(is_read) and x.extra[1:] != (1, None)
+
+
+@pytest.mark.parametrize("count", [1, 7], ids=["one", "several"])
+def test_sine_cosine_and_arctangent(count):
+    right_angles = np.arange(-500, 500) * (np.pi / 2)
+    spread = np.random.default_rng(1).uniform(-1, 1, 1000)
+    ends = [0.0, 1e-300, 1e5, -1e9, 1e300]
+    angles = np.concatenate([right_angles, spread, 9e4 * spread, 1e-5 * spread, ends])
+    angles = np.resize(angles, (-(-angles.size // count), count))
+
+    def each(x):
+        of_row = lambda row: jnp.stack([jnp.sin(row), jnp.cos(row), jnp.atan(row)])
+        return jax.lax.map(of_row, x)
+
+    found = np.asarray(jax.jit(in_one_function(each))(angles))
+    for k, function in enumerate((math.sin, math.cos, math.atan)):
+        exact = np.vectorize(function)(angles)
+        # Rounding errors of both.
+        assert np.all(np.abs(found[:, k] - exact) <= 1.5 * np.spacing(np.abs(exact)))
+    beyond = jax.jit(in_one_function(each))(np.full((2, count), [[np.inf], [np.nan]]))
+    assert np.all(np.isnan(beyond[:, :2]))
+    assert np.all(beyond[0, 2] == np.pi / 2)
 
 
 # Lanes ----------------------------------------------------------------------------------
@@ -721,7 +796,8 @@ def rows_after_the_first(x, y):
     """The cell before the rows belongs to a number that all lanes may share."""
 
     def turn(x, _):
-        x = jnp.sin(x * y[0]) + jnp.cos(y)
+        # It contracts, so that rounding errors do not grow.
+        x = jnp.sin(0.3 * x * y[0]) + jnp.cos(y)
         shared = jnp.stack([x[0], jnp.cos(y[1]), jnp.sin(y[1])])
         return x, (shared[jnp.where(x[1] > 0.3, 1, 2)], x)
 

@@ -1,25 +1,20 @@
 """The graph of a program as code for LLVM: its kernels, and a function that calls them."""
 
-import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
+from . import scheduling
 from .graph import Node, NOT_COMPUTED, Number, Region
 from .kernels import Kernel, Recurrence, recurrences, WIDTH
 from .loops import Scan, While
+from .scheduling import all_regions, kernels_of
 from .values import Cellar, CONSTANTS
 
 
-# Kernels of single numbers with more operations are divided: the time of compilation grows
-# faster than their length. It grows most for loops over lanes. Those that run once and have
-# few lanes are divided too; for the rows of a run it would take longer to write and read.
-_LONGEST, _LONGEST_OF_LANES, _FEW_LANES = 2_500, 300, 256
 # Branches of more operations are compiled when one is first taken. Most runs never need
 # Newton's method or a division of a step, which are more than half of their program.
 _LARGE_BRANCH = 1_000
-# The longest chain of operations that moves to a later kernel with the last of them.
-_LONGEST_SUNK = 8
 
 
 class Emission:
@@ -39,7 +34,7 @@ class Emission:
         self.declared: set[str] = {
             f"declare i1 @llvm.vector.reduce.or.v{WIDTH}i1(<{WIDTH} x i1>)"
         }
-        regions = list(_all_regions(self._root))
+        regions = list(all_regions(self._root))
         self._uniform: dict[Node, bool] = {}
         self._counters = {
             item.counter
@@ -48,9 +43,9 @@ class Emission:
             if isinstance(item, Scan) and not item.is_wide
         }
         self.has_passes = any(region.is_wide for region in regions)
-        kernels = _kernels(regions)
+        kernels = kernels_of(cellar.graph, regions)
         self.length = sum(map(len, kernels.values()))
-        loops = recurrences(regions, kernels, _LONGEST)
+        loops = recurrences(regions, kernels, scheduling.LONGEST)
         self._make_places(kernels, loops)
         self._recurrences = {}
         self._texts: dict[Region, dict[str, str]] = {region: {} for region in regions}
@@ -276,7 +271,7 @@ class Emission:
 
     def _run_branch(self, region: Region) -> None:
         """Runs a branch, as a function of its own if it is large."""
-        within = list(_all_regions(region))
+        within = list(all_regions(region))
         # Passes on all cores are called from `@main`.
         has_passes = not region.is_wide and any(x.is_wide for x in within)
         if has_passes or sum(self._sizes[x] for x in within) <= _LARGE_BRANCH:
@@ -312,94 +307,3 @@ class Emission:
             self._run_branch(inner)
             self._say(f"br label %{off}")
             self._start(off)
-
-
-def _all_regions(region: Region) -> Iterable[Region]:
-    yield region
-    for item in region.items:
-        for inner in item.regions:
-            yield from _all_regions(inner)
-
-
-def _longest(node: Node) -> float:
-    """The most operations in a kernel of such a node."""
-    if not node.lanes:
-        return _LONGEST
-    is_divided = node.region.depth == 0 and node.lanes < _FEW_LANES
-    return _LONGEST_OF_LANES if is_divided else math.inf
-
-
-def _kernels(regions: list[Region]) -> dict[tuple, list[Node]]:
-    """The operations that are needed, by kernel."""
-    live: set[Node] = set()
-    stack = [
-        x
-        for region in regions
-        for x in region.nodes
-        if x.op == "store" or (x.place is not None)
-    ]
-    while stack:
-        node = stack.pop()
-        if node in live:
-            continue
-        live.add(node)
-        stack.extend(x for x in node.operands if isinstance(x, Node) and x not in live)
-    _sink(live)
-    order = {region: k for k, region in enumerate(regions)}
-    needed = [x for x in live if x.op not in NOT_COMPUTED and x.region in order]
-    # Loops over lanes that are divided write last, when all that they read is read.
-    is_late = lambda x: x.op == "store" and x.lanes > 0 and _longest(x) < math.inf
-    needed.sort(key=lambda x: (order[x.region], x.level, x.lanes, is_late(x), x.number))
-    kernels: dict[tuple, list[Node]] = {}
-    parts: dict[tuple, int] = {}
-    for node in needed:
-        key = node.region, node.level, node.lanes
-        part = parts.get(key, 0)
-        # Numbers of a carry are all read before the first is written.
-        is_full = len(kernels.get((*key, part), ())) >= _longest(node)
-        if is_full and node.op != "store":
-            part = parts[key] = part + 1
-        kernels.setdefault((*key, part), []).append(node)
-    return kernels
-
-
-def _sink(live: set[Node]) -> None:
-    """Moves operations into the kernels that use their results, which need no cells."""
-    users: dict[Node, list[Node]] = {}
-    for node in live:
-        for x in node.operands:
-            if isinstance(x, Node):
-                users.setdefault(x, []).append(node)
-
-    def is_movable(x: Node) -> bool:
-        is_computed = x.op not in NOT_COMPUTED and x.op not in ("store", "copy", "dynamic")
-        return is_computed and not x.is_reduced and x.place is None
-
-    def is_stored(x: Node, apart_from: Node) -> bool:
-        """Whether kernels other than that of `x` read it, apart from one operation."""
-        others = (y for y in users[x] if y is not apart_from)
-        key = x.region, x.level, x.lanes
-        return not is_movable(x) or any((y.region, y.level, y.lanes) != key for y in others)
-
-    def can_move(x: Node, depth: int) -> bool:
-        """Whether no operand has to be stored instead."""
-        for y in x.operands:
-            if not isinstance(y, Node) or y.op in NOT_COMPUTED or y.lanes != x.lanes:
-                continue
-            if y.region is x.region and not is_stored(y, x):
-                goes_along = len(users[y]) == 1 and depth > 0 and can_move(y, depth - 1)
-                if not goes_along:
-                    return False
-        return True
-
-    for x in sorted(live, key=lambda x: -x.number):
-        if not is_movable(x):
-            continue
-        own = users.get(x, [])
-        if any(y.region is not x.region or y.lanes != x.lanes for y in own):
-            continue
-        # At the level where a carry is written, it could be read after it was written.
-        level = min((y.level for y in own if y.op != "store"), default=x.level)
-        is_written = any(y.op == "store" for y in own)
-        if level > x.level and not is_written and can_move(x, _LONGEST_SUNK):
-            x.level = level

@@ -218,11 +218,14 @@ class Cellar:
         if flat.size == 1:
             place = np.full(np.shape(value), self.place_of(number_at(value), dtype))
             return Memory(dtype, place)
-        key = flat.tobytes()
+        return Memory(dtype, self._constants_at(flat).reshape(np.shape(value)))
+
+    def _constants_at(self, cells: np.ndarray) -> np.ndarray:
+        """Neighbouring cells with these constants."""
+        key = cells.tobytes()
         if key not in self._constant_places:
-            self._constant_places[key] = self._new_constants(flat)
-        place = self._constant_places[key]
-        return Memory(dtype, (place + np.arange(flat.size)).reshape(np.shape(value)))
+            self._constant_places[key] = self._new_constants(cells)
+        return self._constant_places[key] + np.arange(cells.size)
 
     def _places(self, value: Cells) -> np.ndarray:
         dtype, cells = value.dtype, value.cells
@@ -253,11 +256,12 @@ class Cellar:
         return self.graph.at(owner.region, owner.ready, "load", dtype, extra=place)
 
     def _constant_at(self, place: int, dtype: str) -> Number:
+        return from_bits(self._cell_of_constant(place), dtype)
+
+    def _cell_of_constant(self, place: int) -> Any:
         number = place - CONSTANTS
         block = bisect.bisect_right(self._constant_starts, number) - 1
-        return from_bits(
-            self.constants[block][number - self._constant_starts[block]], dtype
-        )
+        return self.constants[block][number - self._constant_starts[block]]
 
     def lanes_at(self, places: np.ndarray, dtype: str) -> Number:
         """The numbers in a cell for each lane."""
@@ -276,6 +280,10 @@ class Cellar:
         )
         if not stride and np.all(places == first):
             return self.number_at(first, dtype)
+        if np.all(places >= CONSTANTS) and not (is_affine and stride == 1):
+            cells = [self._cell_of_constant(int(p)) for p in places]
+            places = self._constants_at(np.array(cells))
+            first, stride, is_affine = int(places[0]), 1, True
         owners = self._all_owners(places)
         for owner in owners:
             if isinstance(owner, Node) and is_affine and stride == 1:
