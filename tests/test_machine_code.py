@@ -560,26 +560,28 @@ def turned_tables(x):
 
 def scattered_entries(x):
     """Loops that read entries far apart, of what they change and of what they do not."""
-    table = jnp.outer(jnp.arange(1.0, 13), jnp.linspace(0.5, 1, 9)) * x[0, 0]
-    places = np.array([7, 2, 11, 0, 5, 9, 9, 3])
+    table = jnp.outer(jnp.linspace(0.1, 0.3, 16), jnp.linspace(0.5, 1, 9)) * x[0, 0]
+    places = np.array([7, 2, 11, 0, 5, 9, 9, 3, 14, 1, 12, 4])
 
     def inner(k, row):
         # The table changes around this loop, `x` and the constants do not.
-        fixed = table_before[places, 3] + x.ravel()[places % x.size] + 0.1 * places
-        row = jnp.where(k > 2, jnp.sin(row[places % 8] + fixed), row - fixed)
-        return jax.lax.cond(row[0] > 0, lambda: row * table_before[:8, 1], lambda: row)
+        row = 0.5 * row[places % 12] * table_before[places, 3] + 0.1 * places
+        row = jnp.where(k > 2, jnp.sin(row), row - x.ravel()[places % x.size])
+        smaller = lambda: row * table_before[:12, 1]
+        return jax.lax.cond(row[0] > 0.01, smaller, lambda: 0.5 * row)
 
     def outer(k, carry):
         nonlocal table_before
         table, row = carry
         table_before = table + jnp.sin(table) * jnp.sum(row)
+        row = jax.lax.fori_loop(0, 4, inner, row)
         row = jax.lax.fori_loop(0, k + 1, inner, row)
-        table = jnp.cos(table + row[places[:3]].sum()).at[:8, 2].set(row)
+        table = 0.2 * jnp.cos(table + row[places[:3]].sum()).at[:12, 2].set(row)
         # Read by several operations in one pass.
-        return table, row + table[places, 4] * jnp.cumsum(table[places, 4])
+        return table, 0.1 * (row + table[places, 4] * jnp.cumsum(table[places, 4]))
 
     table_before = table
-    return jax.lax.fori_loop(0, 5, outer, (table, jnp.ones(8)))
+    return jax.lax.fori_loop(0, 5, outer, (table, jnp.ones(12)))
 
 
 @pytest.mark.parametrize(
