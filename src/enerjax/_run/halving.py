@@ -93,7 +93,7 @@ def solve_or_divide(
     if max_halvings is None:
         is_large = num_unknowns(memory) > SMALL
         max_halvings = _HALVINGS_OF_LARGE_SYSTEMS if is_large else 0
-    if is_chord_alone(root_finder, scheme, model, memory):
+    if is_chord_alone(root_finder, scheme, model):
         max_halvings = 0
     if max_halvings == 0:
         return step.solve(), jnp.array(0)

@@ -6,8 +6,6 @@ import sys
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax
-
 from .._programs import at_top_level, compiled, in_one_function, is_known, values_of
 from .._progress import Progress
 from .._results import may_need_newton, RESULTS
@@ -236,6 +234,5 @@ def _computed(task: Task) -> tuple[Solution, _Outcome, bool]:
         failed=end.result != RESULTS.successful,
         needs_newton=may_need_newton(end.result),
     )
-    memory = jax.tree.map(lambda x: x[0], end.warm.stages)
-    alone = is_chord_alone(task.root_finder, task.scheme.stage, model, memory)
+    alone = is_chord_alone(task.root_finder, task.scheme.stage, model)
     return solution, outcome, alone

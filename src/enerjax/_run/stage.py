@@ -41,15 +41,6 @@ from .prediction import extrapolated, initial_memory, Memory, memory_after, pred
 
 # Enough for the linear convergence of a step that locks. A step that needs more has failed.
 MAX_ITERATIONS = 50
-# Up to this number of unknowns Newton's method is about as fast as the chord method in
-# short steps, and faster in long ones, where the chord method needs more corrections.
-# A program that must be right for all steps has it alone.
-_FEW = 16
-# Above this number of unknowns the chord method alone is tried first, where a run can be
-# made again: its program compiles faster, and its short steps are faster.
-MOST_BY_NEWTON = 8
-
-
 # Up to this number of unknowns the parts of a step are functions of machine code. In larger
 # steps array operations take longer than their calls, and outside of such a function they
 # are faster: a chain of 64 points takes 75 us a step, and would take 108 us.
@@ -93,7 +84,7 @@ def first_memory(
     flight = free_flight(scheme, problem, model, start)
     added = jax.tree.map(jnp.subtract, z, flight)
     flat, _ = ravel_pytree(flight)
-    both = flat.size > _FEW and has_chord(scheme, model)
+    both = has_chord(scheme, model)
     factors = None if both else kept_factors(flat.size, flat.dtype)
     return initial_memory(added, factors, jnp.array(0) if both else None, carried)
 
@@ -137,7 +128,7 @@ def solve(
         return jax.tree.map(jnp.multiply, scheme.residual(z, problem), scales.per_row)
 
     wait = memory.chord_wait
-    alone = is_chord_alone(root_finder, scheme, model, memory)
+    alone = is_chord_alone(root_finder, scheme, model)
     root = find_root(
         scaled,
         root_finder,
@@ -166,14 +157,9 @@ def is_chord_alone(
     root_finder: RootFinder | ChordAlone,
     scheme: AbstractOneSolveScheme,
     model: AbstractModel,
-    memory: Memory,
 ) -> bool:
     """Whether the exact Jacobian is left out, because there is a chord method."""
-    return (
-        isinstance(root_finder, ChordAlone)
-        and has_chord(scheme, model)
-        and num_unknowns(memory) > root_finder.above
-    )
+    return isinstance(root_finder, ChordAlone) and has_chord(scheme, model)
 
 
 def unsolved(
@@ -263,7 +249,7 @@ def _solved(
     tests = lambda: _gradients_reverse(model, start, end.state)
     no = jnp.array(False)
     # Where the chord method converges, the gradients have hardly changed.
-    if is_chord_alone(root_finder, scheme, model, memory):
+    if is_chord_alone(root_finder, scheme, model):
         reverses = no
     elif memory.chord_wait is None:
         reverses = tests()

@@ -27,7 +27,6 @@ from .._solvers import ChordAlone
 from .._system import AbstractSystem, State, System
 from .._types import Scalar
 from .loop import dispensable_newton
-from .stage import MOST_BY_NEWTON
 from .step import model_for
 from .task import Task
 
@@ -64,7 +63,7 @@ def chord_alone(task: Task, values: Task) -> Task | None:
         return None
     is_separable = isinstance(system, System)
     has_joints = system.constraint is not None or system.driven is not None
-    if not has_joints and (is_separable or 2 * values.start.q.size <= MOST_BY_NEWTON):
+    if not has_joints and is_separable:
         return None
     # The inertia of an arm is ill-conditioned: single precision leaves too few digits.
     if not is_separable and values.start.q.dtype == jnp.float32:
@@ -81,7 +80,7 @@ def chord_alone(task: Task, values: Task) -> Task | None:
         contraction = values_of(_contraction(values))
         if bool(contraction > _CONTRACTS):
             return None
-    return dataclasses.replace(task, root_finder=ChordAlone(newton, MOST_BY_NEWTON))
+    return dataclasses.replace(task, root_finder=ChordAlone(newton))
 
 
 def remember_newton(task: Task) -> None:

@@ -14,16 +14,16 @@ from .linear.user_solver import AbstractSparseSolver
 class Newton(eqx.Module):
     """Newton's method, which solves the scaled step equations to round-off.
 
-    **Chord method.** A search begins with it if the scheme offers it: the energy schemes do
-    for systems with constant inertia and more than 16 unknowns in a step. Its
-    approximate Jacobian contains the inertia and the constraint gradients in the middle of
-    the step, and no stiffness. It is factorised once. If it does not reduce the residual
-    quickly (stiff forces, fast rotations), the exact Jacobian is used.
+    **Chord method.** A search begins with it if the scheme offers it, as the energy schemes
+    do. Its approximate Jacobian contains the inertia and the constraint gradients in the
+    middle of the step, and no stiffness. It is factorised once. If it does not reduce the
+    residual quickly (stiff forces, fast rotations), the exact Jacobian is used.
 
-    **Jacobians.** One exact Jacobian is used for several corrections. The approximate
-    inverse of a small Jacobian is extrapolated from those of the last three steps and then
-    improved iteratively. Let `c_k` be the size of correction `k`. The Jacobian is evaluated
-    again where `c_k > 0.3 c_{k-1}`, and that correction is discarded.
+    **Jacobians.** One exact Jacobian is used for several corrections. Where there is no
+    chord method, the approximate inverse of a small Jacobian is extrapolated from those of
+    the last three steps and then improved iteratively. Let `c_k` be the size of correction
+    `k`. The Jacobian is evaluated again where `c_k > 0.3 c_{k-1}`, and that correction is
+    discarded, unless the residual is of round-off size.
 
     **Damping.** Where the second correction with a Jacobian is hardly smaller than the
     first one, the first one was too long: it is halved, up to seven times (P. Deuflhard's
@@ -48,9 +48,9 @@ class Newton(eqx.Module):
     - `linear_solver`: the solver for the corrections and for derivatives of the root. An
       `AbstractSparseSolver`, such as `KLU()`, receives the structurally nonzero entries of
       the Jacobian; a solver of lineax receives the dense Jacobian. By default the size and
-      the sparsity decide. Up to 32 unknowns, or 16 where the chord method is tried first,
-      it is an inverse in plain array operations. Beyond that it is a banded solver if the
-      unknowns can be ordered such that the Jacobian is a narrow band, else LAPACK.
+      the sparsity decide. Up to 32 unknowns it is an inverse in plain array operations.
+      Beyond that it is a banded solver if the unknowns can be ordered such that the
+      Jacobian is a narrow band, else LAPACK.
       Derivatives are as accurate as the solutions of the solver.
 
     Raises a `TypeError` for a `linear_solver` of another type, and a `ValueError` for a
@@ -82,12 +82,9 @@ class ChordAlone(eqx.Module):
 
     The exact Jacobian is more than half of the program of a step, and smooth motion does
     not need it. `newton` has the tolerances; it searches where there is no chord method.
-
-    - `above`: the number of unknowns above which the chord method searches.
     """
 
     newton: Newton
-    above: int = eqx.field(static=True)
 
 
 class Start(eqx.Module):

@@ -10,7 +10,7 @@ from .._operators import AbstractModel, Increment, SeparableModel
 from .._programs import num_operations, simplified, why_not_one_function
 from .._run.inputs import prepare
 from .._run.loop import dispensable_newton, Stepper
-from .._run.stage import free_flight, is_chord_alone, MOST_BY_NEWTON, step_problem
+from .._run.stage import free_flight, is_chord_alone, step_problem
 from .._run.step import model_for
 from .._run.step_sizes import End, EqualSteps
 from .._solvers import ChordAlone, flattened, linearisable, Newton, RootFinder, SMALL
@@ -110,11 +110,11 @@ def _explained(
     dispensable = dispensable_newton(root_finder, scheme, plan, None)
     search = root_finder
     if dispensable is not None:
-        search = ChordAlone(dispensable, MOST_BY_NEWTON)
+        search = ChordAlone(dispensable)
     stepper = Stepper(scheme, model, plan, search, None)
     begin = stepper.begin(start)
     memory = jax.tree.map(lambda x: x[0], begin.warm.stages)
-    by_chord = is_chord_alone(search, scheme.stage, model, memory)
+    by_chord = is_chord_alone(search, scheme.stage, model)
     step = lambda progress: stepper.attempt(progress, jnp.array(True))
     problem = step_problem(scheme.stage, model, start, h, memory.carried)
     z = free_flight(scheme.stage, problem, model, start)
