@@ -272,7 +272,7 @@ def rows_of_cores(quick: bool, works: Any) -> list[harness.Row]:
             text=True,
             check=True,
         )
-        row = dict(work="double pendulum", kind="sweep", code="enerjax", mode="default")
+        row = dict(work="double pendulum", kind="sweep", code="enerjax", mode="enerjax")
         rows.append(row | dict(cores=cores, seconds=json.loads(out.stdout)))
     return rows
 
@@ -345,6 +345,5 @@ if __name__ == "__main__":
             show,
             draw,
             peers=rows_of_cores,
-            modes=("default",),
             works=tuple(WORKS),
         )

@@ -6,8 +6,7 @@ A soft pendulum falls from the horizontal for 0.2 s, in the plane and in space, 
 of 1 ms, by `EnergyPreserving()`. In the plane EXUDYN (the extra `peers`) has the same
 elements (`ObjectBeamGeometricallyExact2D`), and runs the generalized-alpha method, rho 0.9.
 The energy and the levels of constraints are checked first, and the place of the tip against
-EXUDYN's. Times are medians on one core, with XLA's default settings and with
-`enable_fast_loops()`.
+EXUDYN's. Times are medians on one core.
 
 The errors of the place of the tip after 0.5 s, with 8 elements in the plane, are those of
 the step alone: each program is compared with its own run with steps of 25 us. Times of our
@@ -256,7 +255,7 @@ def draw(rows: list[harness.Row], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
-    for mode, mark in (("exudyn", "s-"), ("default", "o-"), ("fast", "^-")):
+    for mode, mark in (("exudyn", "s-"), ("enerjax", "o-")):
         own = [row for row in rows if row["mode"] == mode and row["dimension"] == 2]
         costs = [row for row in own if "us_per_step" in row and "error" not in row]
         sizes, times = ([row[key] for row in costs] for key in ("work", "us_per_step"))

@@ -20,8 +20,6 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-import enerjax as ej
-
 
 def axes(quick: bool, long: bool) -> dict:
     import extremes_bodies as bodies
@@ -115,5 +113,4 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    ej.enable_fast_loops()
     main()

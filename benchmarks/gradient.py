@@ -7,9 +7,8 @@ the start (along the constraints), the arguments (masses among them), the length
 the step, and alpha of the decaying scheme. It must agree with forward mode and with
 central differences along a random direction, or it is not timed. Memory is what XLA sets
 aside for the program, per unknown of the step equations and step; of a long run too, which
-is compiled but not run. Times are medians over interleaved repeats on one core, with XLA's
-default settings and with `enable_fast_loops()` (two processes). Writes gradient.json and
-gradient.png.
+is compiled but not run. Times are medians over interleaved repeats on one core. Writes
+gradient.json and gradient.png.
 """
 
 import functools
@@ -154,14 +153,10 @@ def draw(rows: list[harness.Row], path: Path) -> None:
         ("time, gradient / forward", "bytes per unknown and step"),
         strict=True,
     ):
-        for shift, mode in enumerate(("default", "fast")):
-            of_mode = [row for row in timed if row["mode"] == mode]
-            places = np.arange(len(of_mode)) + 0.4 * shift
-            axis.bar(places, [row[key] for row in of_mode], width=0.4, label=mode)
-            names = [f"{row['case']}\n{row['scheme']}" for row in of_mode]
-            axis.set_xticks(np.arange(len(names)) + 0.2, names, fontsize=7)
+        names = [f"{row['case']}\n{row['scheme']}" for row in timed]
+        axis.bar(names, [row[key] for row in timed])
+        axis.tick_params(axis="x", labelsize=7)
         axis.set(ylabel=label)
-        axis.legend()
     figure.savefig(path, dpi=130)
 
 

@@ -1,7 +1,7 @@
-"""The harness of the benchmarks: one core, one process for each setting, medians.
+"""The harness of the benchmarks: one core, a process of its own, medians.
 
-A benchmark starts itself once for each setting of XLA, with `--mode`, because XLA reads
-its settings only once; the child prints its rows as the last line of its output.
+A benchmark starts itself once more, with `--child`, so that other programs do not share its
+process; the child prints its rows as the last line of its output.
 """
 
 import argparse
@@ -28,6 +28,13 @@ Row = dict[str, Any]
 RESULTS = Path(__file__).parent / "results"
 DOCUMENTED = Path(__file__).parents[1] / "docs" / "pictures"
 _TIME = "us_per_step"
+# With these settings XLA compiles loops of any size into one function, which loops of
+# diffrax profit by.
+FAST_LOOPS = (
+    "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=10000000 "
+    "--xla_cpu_experimental_ynn_fusion_type=-dot,-reduce,-eltwise "
+    "--xla_cpu_use_fusion_emitters=false"
+)
 
 
 def run(
@@ -36,17 +43,17 @@ def run(
     show: Callable[[list[Row]], None],
     draw: Callable[[list[Row], Path], None],
     peers: Callable[..., list[Row]] = lambda quick: [],
-    modes: Sequence[str] = ("default", "fast"),
     works: Sequence[str] = (),
+    xla_flags: str = "",
 ) -> None:
     """The main program of a benchmark.
 
-    `rows_of` measures the rows of one setting in a separate process, and `peers` those of
-    other programs in this process (twice if these measure the time of a step). Both get a
-    flag for a quick run. `modes` are the settings of XLA. The rows are printed, drawn, and
-    saved under the name of the script; a picture that the documentation shows is replaced
-    there. With `works` both also get the names of the works to measure; each row has its
-    name as `work`, and replaces saved rows of the same work.
+    `rows_of` measures our rows in a separate process, and `peers` those of other programs
+    in this process (twice if these measure the time of a step). Both get a flag for a quick
+    run. The rows are printed, drawn, and saved under the name of the script; a picture that
+    the documentation shows is replaced there. With `works` both also get the names of the
+    works to measure; each row has its name as `work`, and replaces saved rows of the same
+    work. The separate process has these `xla_flags`.
     """
     chosen = _options(sys.modules["__main__"].__doc__ or "", works)
     asked = (
@@ -55,9 +62,7 @@ def run(
         else (chosen.quick,)
     )
     pin()
-    if chosen.mode is not None:
-        if chosen.mode == "fast":
-            ej.enable_fast_loops()
+    if chosen.child:
         jax.config.update("jax_enable_x64", True)
         print(json.dumps(rows_of(*asked)))
         return
@@ -65,7 +70,7 @@ def run(
     flags = ["--quick"] if chosen.quick else []
     flags += ["--only", chosen.only] if chosen.only else []
     others = peers(*asked)
-    rows = _children(script, flags, modes)
+    rows = _rows_of_child(script, flags, xla_flags)
     if any(_TIME in row for row in others):
         # Their runs cannot alternate with ours. They run before and after, and the faster
         # time counts.
@@ -91,7 +96,7 @@ def _options(doc: str, works: Sequence[str]) -> argparse.Namespace:
     parser.set_defaults(only=None)
     if works:
         parser.add_argument("--only", choices=works, help="one of its problems")
-    parser.add_argument("--mode", choices=["default", "fast"], help=argparse.SUPPRESS)
+    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
     return parser.parse_args()
 
 
@@ -101,18 +106,13 @@ def pin() -> None:
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
 
-def _children(script: str, flags: list[str], modes: Sequence[str]) -> list[Row]:
-    """The rows of one child process for each setting; a GPU has only one setting."""
-    rows: list[Row] = []
-    for mode in modes:
-        command = [sys.executable, script, "--mode", mode, *flags]
-        out = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-        *messages, data = out.stdout.splitlines()
-        print("\n".join(messages)) if messages else None
-        rows += [dict(mode=mode) | row for row in json.loads(data)]
-        if any(row["platform"] != "cpu" for row in rows):
-            break
-    return rows
+def _rows_of_child(script: str, flags: list[str], xla_flags: str) -> list[Row]:
+    command = [sys.executable, script, "--child", *flags]
+    env = os.environ | {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {xla_flags}"}
+    out = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=env)
+    *messages, data = out.stdout.splitlines()
+    print("\n".join(messages)) if messages else None
+    return [dict(mode="enerjax") | row for row in json.loads(data)]
 
 
 def write_csv(rows: Sequence[Any], path: Path) -> None:

@@ -205,5 +205,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    ej.enable_fast_loops()
     main()

@@ -2,8 +2,8 @@
 
     python benchmarks/long_run.py [--out FOLDER] [--quick]
 
-Two rods of a metre from the horizontal, and the top in directors. Ours with
-`enable_fast_loops()`; diffrax in minimal coordinates, down to the smallest tolerances;
+Two rods of a metre from the horizontal, and the top in directors. Ours, and
+diffrax in minimal coordinates, down to the smallest tolerances;
 EXUDYN's generalized-alpha method (extra `peers`). Each row: seconds of the processor, and
 the largest error of the energy at a thousand times of the run, which are ends of steps, in
 parts of what the mechanism turns over. EXUDYN's is that at the end of its run, of the top
@@ -210,4 +210,4 @@ def draw(rows: list[harness.Row], path: Path) -> None:
 
 
 if __name__ == "__main__":
-    harness.run(__file__, our_rows, show, draw, exudyn_rows, ["fast"])
+    harness.run(__file__, our_rows, show, draw, exudyn_rows, xla_flags=harness.FAST_LOOPS)

@@ -197,5 +197,4 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    ej.enable_fast_loops()
     main()

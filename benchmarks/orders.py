@@ -16,8 +16,6 @@ from pathlib import Path
 
 import jax
 
-import enerjax
-
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
@@ -84,5 +82,4 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    enerjax.enable_fast_loops()
     main()

@@ -3,10 +3,9 @@
     python benchmarks/step_cost.py [--out FOLDER] [--quick]
 
 Each row is a run, whose error is measured first; a wrong answer is reported and not timed.
-Times are medians over interleaved repeats, of the processor, on one core, with XLA's
-default settings and with `enable_fast_loops()` (two processes). The pendulum is released
-from the horizontal, two unit rods and masses; the top is `problems.heavy_top`. EXUDYN (the
-extra `peers`) runs the generalized-alpha method, rho 0.9, in the same Cartesian
+Times are medians over interleaved repeats, of the processor, on one core. The pendulum is
+released from the horizontal, two unit rods and masses; the top is `problems.heavy_top`.
+EXUDYN (the extra `peers`) runs the generalized-alpha method, rho 0.9, in the same Cartesian
 coordinates. Writes step_cost.json and step_cost.png.
 """
 
@@ -119,7 +118,7 @@ def draw(rows: list[harness.Row], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
-    marks = dict(exudyn="s", default="o", fast="^")
+    marks = dict(exudyn="s", enerjax="o")
     for axis, work in zip(axes, ("pendulum", "top"), strict=True):
         for row in rows:
             if row["work"] == work and "steps" in row:

@@ -6,8 +6,8 @@ Case d of the paper, whose inner mass is 200 times lighter: two seconds, in whic
 whipped around. The error is that of the outer mass at the end, against an explicit run in
 the two angles at tight tolerance. Our schemes beside the generalized-alpha method with the
 same spectral radius at infinity; with steps of varying length `EnergyConsistent(0)`, and
-SciPy's Radau and BDF methods in the angles. Seconds are those of the processor, with
-`enable_fast_loops()`; SciPy calls Python. `--quick` leaves out the shortest steps. Writes
+SciPy's Radau and BDF methods in the angles. Seconds are those of the processor;
+SciPy calls Python. `--quick` leaves out the shortest steps. Writes
 stiff.json and stiff.png.
 """
 
@@ -164,4 +164,4 @@ def draw(rows: list[harness.Row], path: Path) -> None:
 
 
 if __name__ == "__main__":
-    harness.run(__file__, our_rows, show, draw, scipy_rows, ["fast"])
+    harness.run(__file__, our_rows, show, draw, scipy_rows)

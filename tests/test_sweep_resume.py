@@ -102,7 +102,6 @@ def test_settings_that_change_no_shape_make_another_sweep(tmp_path):
 
 FINGERPRINT = """
 import enerjax as ej
-ej.enable_fast_loops()
 import jax
 from enerjax._programs import digest
 from tests.test_sweep_resume import stepped

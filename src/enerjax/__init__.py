@@ -23,7 +23,6 @@ from ._discrete import (
     Gonzalez as Gonzalez,
     MeanValue as MeanValue,
 )
-from ._programs import enable_fast_loops as enable_fast_loops
 from ._results import RESULTS as RESULTS
 from ._run import (
     AbstractController as AbstractController,

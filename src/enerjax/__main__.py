@@ -12,8 +12,6 @@ from pathlib import Path
 
 import jax
 
-from ._programs import enable_fast_loops
-
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
@@ -73,6 +71,4 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    # Not in `main`: whoever calls that decides for their own process.
-    enable_fast_loops()
     main()

@@ -14,7 +14,6 @@ from .compiled import (
 )
 from .counting import num_operations as num_operations
 from .digest import checksum as checksum, digest as digest
-from .fast_loops import enable_fast_loops as enable_fast_loops
 from .hashable_indices import Indices as Indices
 from .jaxprs import (
     evaluate as evaluate,
