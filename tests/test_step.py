@@ -46,7 +46,10 @@ def test_a_loop_over_step_is_a_run(scheme):
     np.testing.assert_allclose(states.q, run.ys.q[2:], **SAME)
     np.testing.assert_allclose(states.v, run.ys.v[2:], **SAME)
     np.testing.assert_allclose(dissipated, run.audit.dissipated[2:], **SAME)
-    np.testing.assert_array_equal(iterations, run.stats.newton_iterations[1:])
+    # Round-off can decide whether a step needs one more correction.
+    more = np.abs(iterations - run.stats.newton_iterations[1:])
+    assert more.max() <= 1
+    assert more.mean() <= 0.05
     np.testing.assert_allclose(first.state.q, run.ys.q[1], **SAME)
 
 
