@@ -108,7 +108,8 @@ def pin() -> None:
 
 def _rows_of_child(script: str, flags: list[str], xla_flags: str) -> list[Row]:
     command = [sys.executable, script, "--child", *flags]
-    env = os.environ | {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {xla_flags}"}
+    all_flags = f"{os.environ.get('XLA_FLAGS', '')} {xla_flags}".strip()
+    env = os.environ | ({"XLA_FLAGS": all_flags} if all_flags else {})
     out = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=env)
     *messages, data = out.stdout.splitlines()
     print("\n".join(messages)) if messages else None
