@@ -18,9 +18,9 @@ from jax.extend import source_info_util
 from .graph import as_number, Graph, Node, Number, Region
 
 
-# Arrays with fewer entries are not computed lane by lane, and neither are those whose
-# longest axis is shorter.
-_SMALL, _FEWEST_LANES = 24, 5
+# Arrays with no more entries are not computed lane by lane unless they are vectors of many,
+# and neither are those whose longest axis is shorter.
+_SMALL, _MANY, _FEWEST_LANES = 24, 8, 5
 # The most nodes of one array; larger arrays are computed as one axis of lanes.
 MOST_CELLS = 1_600
 # Cells from this number on hold constants.
@@ -549,7 +549,7 @@ def lane_of(values: list[Value], shape: tuple[int, ...]) -> int | None:
 
 def usual_lane(shape: tuple[int, ...]) -> int | None:
     size, longest = int(np.prod(shape)), max(shape, default=0)
-    if longest < _FEWEST_LANES or (size <= _SMALL and longest < 12):
+    if longest < _FEWEST_LANES or (size <= _SMALL and longest < _MANY):
         return None
     return shape.index(longest)
 
