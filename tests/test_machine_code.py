@@ -599,6 +599,33 @@ def test_loops_that_are_written_as_loops(fn, monkeypatch):
     jax.tree.map(close, found, expected)
 
 
+def constants_between_ends(x):
+    """The first constants of a program: no cell is before them."""
+    row = jnp.concatenate([x[:1, 0], np.linspace(0.1, 0.9, 20), x[:1, 1]])
+    return row * jnp.sin(row) + row
+
+
+def neighbours_in_branches(x):
+    """Both branches read neighbouring cells, and others at the ends."""
+    places = np.r_[5, 0:28, 7]
+    row = jnp.resize(x.ravel(), 30) + jnp.linspace(0, 0.1, 30)
+
+    def turn(k, row):
+        one = lambda: 0.5 * jnp.sin(row[places]) + 0.1
+        return jax.lax.cond(row[0] > 0.3, one, lambda: 0.3 * jnp.cos(row[places]))
+
+    return jax.lax.fori_loop(0, 7, turn, row)
+
+
+@pytest.mark.parametrize(
+    "fn", [constants_between_ends, neighbours_in_branches], ids=lambda fn: fn.__name__
+)
+def test_neighbouring_cells_with_others_at_the_ends(fn):
+    assert is_compiled(in_one_function(fn), X)
+    found, expected = jax.jit(in_one_function(fn))(X), jax.jit(fn)(X)
+    np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
+
+
 def test_loops_do_not_gather_what_they_do_not_change():
     table, places = jnp.arange(60.0).reshape(10, 6), np.array([7, 2, 9, 0, 5])
 
@@ -631,7 +658,7 @@ def is_gather(x):
 def test_sine_cosine_and_arctangent(count):
     right_angles = np.arange(-500, 500) * (np.pi / 2)
     spread = np.random.default_rng(1).uniform(-1, 1, 1000)
-    ends = [0.0, 1e-300, 1e5, -1e9, 1e300]
+    ends = [0.0, -0.0, 1e-300, 1e5, -1e9, 1e300]
     angles = np.concatenate([right_angles, spread, 9e4 * spread, 1e-5 * spread, ends])
     angles = np.resize(angles, (-(-angles.size // count), count))
 
@@ -642,6 +669,7 @@ def test_sine_cosine_and_arctangent(count):
     found = np.asarray(jax.jit(in_one_function(each))(angles))
     for k, function in enumerate((math.sin, math.cos, math.atan)):
         exact = np.vectorize(function)(angles)
+        assert np.array_equal(np.signbit(found[:, k]), np.signbit(exact))
         # Rounding errors of both.
         assert np.all(np.abs(found[:, k] - exact) <= 1.5 * np.spacing(np.abs(exact)))
     beyond = jax.jit(in_one_function(each))(np.full((2, count), [[np.inf], [np.nan]]))

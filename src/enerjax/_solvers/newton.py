@@ -48,9 +48,9 @@ class Newton(eqx.Module):
     - `linear_solver`: the solver for the corrections and for derivatives of the root. An
       `AbstractSparseSolver`, such as `KLU()`, receives the structurally nonzero entries of
       the Jacobian; a solver of lineax receives the dense Jacobian. By default the size and
-      the sparsity decide. Up to 32 unknowns it is an inverse in plain array operations.
-      Beyond that it is a banded solver if the unknowns can be ordered such that the
-      Jacobian is a narrow band, else LAPACK.
+      the sparsity decide. It is a banded solver if the unknowns can be ordered such that
+      the Jacobian is a narrow band, else an inverse in plain array operations up to 32
+      unknowns (without a chord method in any case), and LAPACK beyond.
       Derivatives are as accurate as the solutions of the solver.
 
     Raises a `TypeError` for a `linear_solver` of another type, and a `ValueError` for a

@@ -35,6 +35,10 @@ _UNDAMPED_PATIENCE = 20
 _SHRINKS = 0.3
 # A Jacobian that has decreased a correction by this factor is accurate.
 _SHRINKS_FAST = 0.1
+# Corrections with it stop decreasing at once if their contraction grows by this factor.
+_AT_ONCE = 5
+# The round-off of residuals with stiff forces, relative to that of others.
+_OF_STIFF_FORCES = 8
 # Where coordinates lie far from the origin, a search ends after this many corrections in a
 # row that do not decrease.
 _STALLS = 4
@@ -50,8 +54,7 @@ class Powers(NamedTuple):
     - `small`: a correction or a residual below this is in the range of convergence.
     - `moderate`: a residual above this is not round-off, however far from the origin the
       coordinates lie.
-    - `tiny`: a residual below this is round-off if a new Jacobian does not reduce it, or if
-      an accurate one no longer does.
+    - `tiny`: a residual below this is round-off if a new Jacobian does not reduce it.
     - `round_off`: a residual below this is round-off if a Jacobian that has reduced it
       before no longer does. The largest residual of a long chain or beam is larger: forces
       are handed on from body to body, and their rounding errors with them.
@@ -302,11 +305,12 @@ def _classify(
     is_root = (defect <= newton.atol * powers.eps) & small
     # Corrections with one Jacobian that have decreased and stop decreasing are round-off.
     met = ~fresh & ~shrinks & (iterate.contraction > 0)
-    # So are larger ones, such as those of stiff forces, if the Jacobian has been accurate.
-    # The motion of a light body can converge slowly after that of a heavy one has
-    # converged, so the correction must be tiny too.
-    fell_fast = iterate.accurate & (size <= powers.tiny)
-    bound = jnp.where(fell_fast, powers.tiny, powers.round_off)
+    # So are larger ones, such as those of stiff forces, if they decrease no more at once. A
+    # Jacobian that is not exact contracts at a constant rate. The motion of a light body
+    # can converge slowly after that of a heavy one, so the correction must be tiny too.
+    ends_at_once = iterate.accurate & (contraction > _AT_ONCE * iterate.contraction)
+    ends_at_once = ends_at_once & (size <= powers.tiny)
+    bound = jnp.where(ends_at_once, _OF_STIFF_FORCES, 1) * powers.round_off
     met = met & (defect <= bound) & small
     # A small correction with a new Jacobian that is not smaller than the one before is
     # round-off too, if the residual is tiny. It is larger where coordinates lie a million

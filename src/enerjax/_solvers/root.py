@@ -19,7 +19,7 @@ from .._programs import call_traced_once, in_one_function, is_known, part, simpl
 from .._types import Flag, Scalar
 from .linear.dense import AbstractFactors
 from .linear.jacobian import Linearisable
-from .linear.krylov import FEW_UNKNOWNS, jacobian_solver
+from .linear.krylov import jacobian_solver
 from .newton import ChordAlone, Start
 from .root_finding import (
     Chord,
@@ -92,13 +92,13 @@ def _change(
     """The rate of change of a root of equations that have a chord method.
 
     Where the approximate Jacobian is close to the exact one, a few products with the latter
-    are cheaper than its entries. Of few unknowns, products suffice in any case.
+    are cheaper than its entries.
     """
     flat, unravel = ravel_pytree(value)
     prepared = part(lambda: chord.prepare(value, args))()
     correct = lambda x: ravel_pytree(chord.correct(unravel(x), args, prepared))[0]
     by_entries = None
-    if flat.size > FEW_UNKNOWNS and not isinstance(root_finder, ChordAlone):
+    if not isinstance(root_finder, ChordAlone):
         by_entries = lambda right: exact.solve(flat, right)
     return jacobian_solver(exact.value, flat, correct, by_entries)(right)
 

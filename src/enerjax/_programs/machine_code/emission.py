@@ -23,7 +23,7 @@ class Emission:
     - `functions`: the kernels, and `@main`, which has the loops and branches, by name.
     - `late`: for each branch that is compiled when it is first taken, its kernels and
       `@branch`, which calls them.
-    - `declared`: the functions from outside that these call.
+    - `declared`: the functions that these call: declarations, and the text of some.
     - `length`: the number of operations.
     """
 

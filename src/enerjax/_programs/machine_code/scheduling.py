@@ -115,7 +115,8 @@ def _copy_scattered(graph: Graph, live: set[Node], regions: list[Region]) -> Non
     """Copies numbers of lanes from scattered cells to neighbouring ones.
 
     Scattered cells are read one by one. What a loop does not change is copied before the
-    loop, and what several kernels read is copied by the first of them.
+    loop, and what several kernels of a loop read is copied by the first of them. Where
+    several passes are made at a time, numbers of lanes are read as vectors anyway.
     """
     items = [item for region in regions for item in region.items]
     repeated = {x for item in items for x in _repeated_regions(item)}

@@ -175,6 +175,8 @@ def _sine_and_cosine(b: _Body) -> tuple[str, str]:
     square = b.op("fmul", angle, angle)
     cube = b.op("fmul", angle, square)
     sine = b.op("fadd", angle, b.fma(b.polynomial(square, _SINE), cube, rest))
+    # Zero keeps its sign.
+    sine = b.call("copysign", sine, angle)
     half = b.op("fmul", square, b.known(0.5))
     near_one = b.op("fsub", b.known(1.0), half)
     left = b.op("fsub", b.op("fsub", b.known(1.0), near_one), half)

@@ -126,9 +126,10 @@ class Cellar:
         self.size = 1
         self._starts: list[int] = []
         self._owners: list[Node | Block] = []
-        self.constants: list[np.ndarray] = []
-        self.num_constants = 0
-        self._constant_starts: list[int] = []
+        # Neither is the first constant.
+        self.constants = [np.zeros(1, np.int64)]
+        self.num_constants = 1
+        self._constant_starts = [0]
         self._constant_places: dict[Any, int] = {}
         self._arrays = np.zeros(0, np.int64), np.zeros(0, np.int64)
         # Whether some cells have a number for each of several passes.
@@ -268,7 +269,11 @@ class Cellar:
         places = self.of_one_memory(places, dtype)
         key = places.tobytes(), dtype
         if key not in self._read_before:
-            self._read_before[key] = self._lanes_at(places, dtype)
+            x = self._lanes_at(places, dtype)
+            if isinstance(x, Node) and x.op == "select":
+                # It may have been computed in a branch, and other branches do not run that.
+                return x
+            self._read_before[key] = x
         return self._read_before[key]
 
     def _lanes_at(self, places: np.ndarray, dtype: str) -> Number:

@@ -23,7 +23,7 @@ Map = Callable[[Vector], Vector]
 # Up to this number of unknowns the conjugate residuals keep all directions, which suffice
 # with any approximate inverse. If there are more unknowns they keep few directions, because
 # each correction copies all of them.
-FEW_UNKNOWNS, _FEW_DIRECTIONS = 64, 16
+_FEW_UNKNOWNS, _FEW_DIRECTIONS = 64, 16
 # The most searches. Each begins with the true residual of the one before, from which the
 # residual that the iterations keep differs by round-off, and after a breakdown by more.
 # With few directions they go on from one another: with an approximate inverse by which
@@ -122,7 +122,7 @@ def _by_conjugate_residuals(product: Map, approximate: Map, right: Vector) -> Ve
     """Searches that follow one another, each from the true residual of the one before."""
     eps = jnp.finfo(right.dtype).eps
     size = _norm(right)
-    searches = _SEARCHES if right.size <= FEW_UNKNOWNS else _SEARCHES_BY_FEW
+    searches = _SEARCHES if right.size <= _FEW_UNKNOWNS else _SEARCHES_BY_FEW
 
     def refined(carry: tuple[Vector, Vector, Count]) -> tuple[Vector, Vector, Count]:
         x, left, count = carry
@@ -141,7 +141,7 @@ def _norm(x: Vector) -> Scalar:
 
 def _found(product: Map, approximate: Map, right: Vector) -> Vector:
     """The solution that one search finds."""
-    most = right.size if right.size <= FEW_UNKNOWNS else _FEW_DIRECTIONS
+    most = right.size if right.size <= _FEW_UNKNOWNS else _FEW_DIRECTIONS
     eps = jnp.finfo(right.dtype).eps
     put = jax.lax.dynamic_update_index_in_dim
     size = _norm(right)
