@@ -346,4 +346,5 @@ if __name__ == "__main__":
             draw,
             peers=rows_of_cores,
             works=tuple(WORKS),
+            xla_flags=harness.FAST_LOOPS,
         )
