@@ -608,7 +608,7 @@ def constants_between_ends(x):
 def neighbours_in_branches(x):
     """Both branches read neighbouring cells, and others at the ends."""
     places = np.r_[5, 0:28, 7]
-    row = jnp.resize(x.ravel(), 30) + jnp.linspace(0, 0.1, 30)
+    row = jnp.resize(x.ravel(), (30,)) + jnp.linspace(0, 0.1, 30)
 
     def turn(k, row):
         one = lambda: 0.5 * jnp.sin(row[places]) + 0.1

@@ -1,6 +1,8 @@
 """A check at the start of a run that discrete gradients satisfy their definition."""
 
-from collections.abc import Callable
+import dataclasses
+import functools
+from collections.abc import Callable, Hashable
 from typing import Any
 
 import jax
@@ -9,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .._discrete import AbstractCorrected, AbstractDerivative, ChainRule
-from .._programs import compiled_for_once, is_known
+from .._programs import compiled_for_once, is_known, structure_of
 from .._system import (
     AbstractSystem,
     describe,
@@ -35,8 +37,14 @@ def check_derivatives(
     """Raises an error for a discrete gradient that violates its definition.
 
     `D(a, a)` must be the gradient at `a`, and `D(a, b) . (b - a)` the difference of the
-    values. Corrected mean gradients satisfy both by construction and are not checked.
+    values. Corrected mean gradients satisfy both by construction and are not checked. What
+    has passed is not checked again with other numbers: the check takes as long as hundreds
+    of steps of a small system.
     """
+    structure = structure_of((scheme, system, state, args))
+    record = _Record() if structure is None else _remembered(structure)
+    if record.has_passed:
+        return
     is_derivative = lambda x: isinstance(x, AbstractDerivative)
     for derivative in jax.tree.leaves(scheme, is_leaf=is_derivative):
         if not is_derivative(derivative) or isinstance(derivative, AbstractCorrected):
@@ -62,6 +70,19 @@ def check_derivatives(
                     "that is intended set `is_directional = False` in the class: "
                     "`solution.audit` then shows what is lost or gained."
                 )
+    record.has_passed = True
+
+
+@dataclasses.dataclass
+class _Record:
+    """What is known of the discrete gradients of a system."""
+
+    has_passed: bool = False
+
+
+@functools.lru_cache(maxsize=256)
+def _remembered(structure: Hashable) -> _Record:
+    return _Record()
 
 
 def _remedy(derivative: AbstractDerivative) -> str:

@@ -126,8 +126,10 @@ def _wait_after(wait: Count | None, root: Root) -> Count | None:
 def extrapolated(x: Array | Sequence[Array]) -> Array:
     """The value after equidistant values, newest first, by the polynomial through them."""
     count = len(x)
-    terms = [(-1) ** k * math.comb(count, k + 1) * x[k] for k in range(count)]
-    return sum(terms[1:], terms[0])
+    total = count * x[0]
+    for k in range(1, count):
+        total = total + (-1) ** k * math.comb(count, k + 1) * x[k]
+    return total
 
 
 def _shifted(new: Array, old: Array) -> Array:

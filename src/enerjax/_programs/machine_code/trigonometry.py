@@ -183,15 +183,20 @@ def _sine_and_cosine(b: _Body) -> tuple[str, str]:
     left = b.op("fsub", left, b.op("fmul", angle, rest))
     fourth = b.op("fmul", square, square)
     cosine = b.op("fadd", near_one, b.fma(b.polynomial(square, _COSINE), fourth, left))
-    # The quadrant is in the last two bits.
-    bits = b.as_bits(shifted)
-    odd = b.is_set(b.bitwise("and", bits, 1))
-    swapped = b.select(odd, cosine, sine), b.select(odd, sine, cosine)
-    signs = b.bitwise("and", bits, 2), b.bitwise("and", b.bitwise("add", bits, 1), 2)
-    return tuple(
-        b.as_real(b.bitwise("xor", b.as_bits(x), b.bitwise("shl", sign, 62)))
-        for x, sign in zip(swapped, signs, strict=True)
+    # The quadrant is in the last two bits. A cosine is a sine in the next quadrant.
+    quadrant = b.as_bits(shifted)
+    odd = b.is_set(b.bitwise("and", quadrant, 1))
+    after = b.bitwise("add", quadrant, 1)
+    return (
+        _with_sign_of(b, b.select(odd, cosine, sine), quadrant),
+        _with_sign_of(b, b.select(odd, sine, cosine), after),
     )
+
+
+def _with_sign_of(b: _Body, x: str, quadrant: str) -> str:
+    """`x`, or `-x` in the third and fourth quadrants."""
+    sign = b.bitwise("shl", b.bitwise("and", quadrant, 2), 62)
+    return b.as_real(b.bitwise("xor", b.as_bits(x), sign))
 
 
 def _arctangent(width: int) -> str:
