@@ -407,8 +407,8 @@ FAULTS = (
     Fault(
         "prediction: extrapolation where it is worse",
         "_run/prediction.py",
-        "jnp.where(each <= least,",
-        "jnp.where(each >= least,",
+        "_BETTER[k] * each <= least",
+        "_BETTER[k] * each >= least",
         "Steps begin from the worse of two guesses.",
         of(
             "step::test_the_memory_of_earlier_steps_saves_iterations_and_changes_no_result",

@@ -14,8 +14,10 @@ from .._solvers import AbstractFactors, max_norm, Root
 from .._types import Count, Scalar
 
 
-# The numbers of steps from which the candidates for a prediction are extrapolated.
-_CANDIDATES = (1, 3, 5)
+# The numbers of steps from which the candidates for a prediction are extrapolated, and by
+# how many times an extrapolation must have been better than those of fewer steps. In steps
+# that do not resolve the motion, the one of five steps leads to other roots.
+_CANDIDATES, _BETTER = (1, 3, 5), (1, 1, 10)
 # The number of steps whose unknowns are kept.
 NUM_KEPT = max(_CANDIDATES)
 # The number of steps without the chord method after it has failed. The causes of a failure
@@ -101,7 +103,8 @@ def memory_after(
     errors = [error(guess) for guess in _candidates(memory)]
     least, choice = errors[0], jnp.zeros_like(memory.choice)
     for k, each in enumerate(errors[1:], 1):
-        choice = jnp.where(each <= least, jnp.asarray(k, choice.dtype), choice)
+        is_best = _BETTER[k] * each <= least
+        choice = jnp.where(is_best, jnp.asarray(k, choice.dtype), choice)
         least = jnp.minimum(each, least)
     # A search by the chord method alone has no factors; those of earlier steps are kept.
     factors = memory.factors
