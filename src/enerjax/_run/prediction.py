@@ -19,7 +19,7 @@ from .._types import Count, Scalar
 # that do not resolve the motion, the one of five steps leads to other roots.
 _CANDIDATES, _BETTER = (1, 3, 5), (1, 1, 10)
 # The number of steps whose unknowns are kept.
-NUM_KEPT = max(_CANDIDATES)
+_NUM_KEPT = max(_CANDIDATES)
 # The number of steps without the chord method after it has failed. The causes of a failure
 # (stiff forces, fast rotations) usually last for several steps, and each attempt costs a
 # few evaluations of the residual.
@@ -31,7 +31,7 @@ class Memory(eqx.Module):
 
     - `added`: the unknowns of the last five steps minus those of a free flight, newest
       first.
-    - `choice`: the number of the candidate that would have predicted the last step best.
+    - `choice`: the number of the candidate for the next prediction; see `predicted`.
     - `factors`: the factors of the Jacobians of the last three steps, newest first; `None`
       for large systems, and where the chord method is used.
     - `chord_wait`: the number of steps until the chord method is tried again; `None` where
@@ -56,7 +56,7 @@ def initial_memory(
     """The memory before the first step, which is predicted to add `added`."""
     repeated = lambda tree, count: jax.tree.map(lambda x: jnp.stack([x] * count), tree)
     return Memory(
-        added=jax.lax.stop_gradient(repeated(added, NUM_KEPT)),
+        added=jax.lax.stop_gradient(repeated(added, _NUM_KEPT)),
         choice=jnp.array(0),
         factors=repeated(factors, 3),
         chord_wait=chord_wait,
@@ -69,7 +69,8 @@ def predicted(memory: Memory) -> PyTree[Any]:
 
     For a motion that changes quickly it is the difference of the last step. For a smooth
     one it is the quadratic extrapolation of the last three steps, and for short steps that
-    of degree four. The candidate is chosen that would have been best for the last step.
+    of degree four from five. The last step decides: the candidate is chosen that would have
+    been best for it, that of degree four only if it would have been ten times better.
     """
     candidates = _candidates(memory)
 
@@ -170,7 +171,7 @@ def for_length(
         smooth = sum(shaped(w) * rate for w, rate in zip(weights, rates, strict=True))
         # A parabola through the last value and, after it, the extrapolated one.
         last, rise = length * rates[0], length * (smooth - rates[0])
-        values = [last + 0.5 * k * (k - 1) * rise for k in range(NUM_KEPT)]
+        values = [last + 0.5 * k * (k - 1) * rise for k in range(_NUM_KEPT)]
         return jnp.stack(values, axis=1)
 
     added = jax.tree.map(resampled, memory.added)

@@ -7,6 +7,7 @@ fdlibm (Sun Microsystems, 1993). The arctangent is the rational function of Ceph
 Moshier, 1989). The results are off by less than a unit in the last place.
 """
 
+import functools
 import struct
 
 
@@ -56,6 +57,7 @@ _ARCTANGENT = (
 _TAN_67, _NEAR_ONE = 2.414213562373095048802, 0.66
 
 
+@functools.cache
 def functions(width: int) -> tuple[str, ...]:
     """`sincos` and `arctangent` of so many numbers, and the functions that they call."""
     real = f"<{width} x double>" if width > 1 else "double"
