@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 
 import enerjax as ej
 from enerjax._operators import DelassusMatrix, make_model
-from enerjax._run import without_jacobian
+from enerjax._run import experience
 from enerjax._run.prediction import extrapolated
 from enerjax._solvers import Chord, find_root, Newton, schur, schur_tables
 from enerjax._solvers.linear.block_diagonal import in_blocks
@@ -384,7 +384,7 @@ def test_newton_follows_where_springs_are_too_stiff_for_the_chord():
 def searched_by(monkeypatch):
     """The root finders of the programs that runs have used, by name."""
     # Without what other tests have shown of the same systems.
-    without_jacobian._remembered.cache_clear()
+    experience.remembered.cache_clear()
     module, names = sys.modules["enerjax._run.simulate"], []
     run = module._run
 

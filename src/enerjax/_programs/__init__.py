@@ -20,6 +20,7 @@ from .jaxprs import (
     function_with_own_derivative as function_with_own_derivative,
     interpret as interpret,
     is_known as is_known,
+    module_of as module_of,
     name_of as name_of,
     parts_of_scan as parts_of_scan,
     programs_within as programs_within,

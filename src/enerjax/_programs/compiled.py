@@ -27,7 +27,7 @@ _FOR_ONCE = _QUICKLY | {"xla_backend_optimization_level": 0}
 Arguments = ParamSpec("Arguments")
 Value = TypeVar("Value")
 _Static: TypeAlias = tuple[tuple[tuple[Any, ...], tuple[Any, ...]], Any]
-_Structure: TypeAlias = tuple[_Static, tuple[jax.ShapeDtypeStruct, ...]]
+_Structure: TypeAlias = tuple[_Static, tuple[tuple[tuple[int, ...], Any], ...]]
 
 
 def compiled(fn: Callable[Arguments, Value]) -> Callable[Arguments, Value]:
@@ -123,7 +123,8 @@ def once_per_structure(check: Callable[..., None]) -> Callable[..., None]:
 
     @functools.lru_cache(maxsize=128)
     def of_structure(structure: _Structure) -> None:
-        check(*_joined(*structure))
+        static, types = structure
+        check(*_joined(static, (jax.ShapeDtypeStruct(*x) for x in types)))
 
     @functools.wraps(check)
     def call(*args: Any) -> None:
@@ -141,7 +142,7 @@ def structure_of(tree: PyTree[Any]) -> "_Structure | None":
     static, arrays = _parts(tree)
     if not is_hashable(static):
         return None
-    return static, tuple(jax.ShapeDtypeStruct(np.shape(x), x.dtype) for x in arrays)
+    return static, tuple((x.shape, x.dtype) for x in arrays)
 
 
 def is_hashable(x: Any) -> bool:

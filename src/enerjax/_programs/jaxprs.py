@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import jax
@@ -18,6 +19,11 @@ from .primitives import CALLS, JIT, LINEAR_SOLVE, WITH_OWN_DERIVATIVE
 def is_known(tree: Any) -> bool:
     """Whether every number in `tree` has a value now: whether no leaf is traced."""
     return not any(isinstance(x, Tracer) for x in jax.tree.leaves(tree))
+
+
+def module_of(*values: Any) -> ModuleType:
+    """`numpy` for known values, so that nothing is compiled; else `jax.numpy`."""
+    return np if is_known(values) else jnp
 
 
 def has_numbers(x: Any) -> bool:

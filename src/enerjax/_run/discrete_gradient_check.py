@@ -1,8 +1,6 @@
 """A check at the start of a run that discrete gradients satisfy their definition."""
 
-import dataclasses
-import functools
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -11,7 +9,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .._discrete import AbstractCorrected, AbstractDerivative, ChainRule
-from .._programs import compiled_for_once, is_known, structure_of
+from .._programs import compiled_for_once, is_known
 from .._system import (
     AbstractSystem,
     describe,
@@ -22,6 +20,7 @@ from .._system import (
 )
 from .._types import Args, Flag, Scalar
 from ..schemes import AbstractScheme
+from .experience import Experience
 
 
 # The round-off of a gradient may be this many times that of its entries.
@@ -32,7 +31,11 @@ _DISTANCE = 1e-3
 
 
 def check_derivatives(
-    scheme: AbstractScheme, system: AbstractSystem, state: State, args: Args
+    scheme: AbstractScheme,
+    system: AbstractSystem,
+    state: State,
+    args: Args,
+    experience: Experience,
 ) -> None:
     """Raises an error for a discrete gradient that violates its definition.
 
@@ -41,9 +44,7 @@ def check_derivatives(
     has passed is not checked again with other numbers: the check takes as long as hundreds
     of steps of a small system.
     """
-    structure = structure_of((scheme, system, state, args))
-    record = _Record() if structure is None else _remembered(structure)
-    if record.has_passed:
+    if experience.has_valid_gradients:
         return
     is_derivative = lambda x: isinstance(x, AbstractDerivative)
     for derivative in jax.tree.leaves(scheme, is_leaf=is_derivative):
@@ -70,19 +71,7 @@ def check_derivatives(
                     "that is intended set `is_directional = False` in the class: "
                     "`solution.audit` then shows what is lost or gained."
                 )
-    record.has_passed = True
-
-
-@dataclasses.dataclass
-class _Record:
-    """What is known of the discrete gradients of a system."""
-
-    has_passed: bool = False
-
-
-@functools.lru_cache(maxsize=256)
-def _remembered(structure: Hashable) -> _Record:
-    return _Record()
+    experience.has_valid_gradients = True
 
 
 def _remedy(derivative: AbstractDerivative) -> str:

@@ -5,13 +5,13 @@ of `jit`, `vmap` and `grad`.
 """
 
 import operator
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._programs import is_known
+from .._programs import is_known, module_of
 from .._solvers import RootFinder
 from .._system import (
     AbstractSystem,
@@ -25,6 +25,23 @@ from .._system import (
 from .._types import Args, Real, Scalar
 from ..schemes import AbstractScheme, AbstractSchemeWithRotations
 from .discrete_gradient_check import check_derivatives
+from .experience import Experience, experience_of
+
+
+class Prepared(NamedTuple):
+    """The checked arguments of a run.
+
+    - `start`, `args`: the start, and `args` as arrays.
+    - `h`, `t`: the length of a step and the time of the start in the dtype of the start;
+      NumPy numbers if they are known.
+    - `experience`: what earlier calls have shown of the system.
+    """
+
+    start: State
+    args: Args
+    h: Scalar
+    t: Scalar
+    experience: Experience
 
 
 def prepare(
@@ -35,8 +52,8 @@ def prepare(
     h: Real,
     t: Real,
     root_finder: RootFinder,
-) -> tuple[State, Args, Scalar, Scalar]:
-    """The checked start, `args` as arrays, and `h` and `t` in the dtype of the start."""
+) -> Prepared:
+    """Checks the arguments of a run."""
     if not isinstance(root_finder, RootFinder.__value__):
         raise TypeError(
             "`root_finder` must be a root finder such as `enerjax.Newton()`, or a root "
@@ -65,18 +82,18 @@ def prepare(
     check_number("h", h)
     if is_known(h) and np.ndim(h) == 0 and not 0 < float(np.real(h)) < np.inf:
         raise ValueError(f"`h` must be positive and finite, got {h}.")
-    h = jnp.asarray(h, start.q.dtype)
+    h = module_of(h).asarray(h, start.q.dtype)
     if h.ndim != 0:
         raise ValueError(
             f"`h` must be a scalar, got shape {h.shape}. To sweep it use `jax.vmap`."
         )
-    if is_known((system, start, args)) and not isinstance(
-        scheme.stage, AbstractSchemeWithRotations
-    ):
+    experience = experience_of(scheme, system, start, args)
+    has_rotations = isinstance(scheme.stage, AbstractSchemeWithRotations)
+    if not has_rotations and is_known((system, start, args)):
         check_without_rotations(system, start, args, type(scheme.stage).__name__)
     if is_known((scheme, system, start, args)):
-        check_derivatives(scheme, system, start, args)
-    return start, args, h, jnp.asarray(t, h.dtype)
+        check_derivatives(scheme, system, start, args, experience)
+    return Prepared(start, args, h, module_of(t).asarray(t, h.dtype), experience)
 
 
 def positive_integer(name: str, count: Any) -> int:

@@ -3,7 +3,6 @@
 They are made piece by piece, and are on the host between two pieces.
 """
 
-import dataclasses
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -48,7 +47,7 @@ class _LongRun:
     """
 
     def __init__(self, task: Task, num_rows: int):
-        self._task = dataclasses.replace(task, plan=task.plan.unlimited())
+        self._task = task._replace(plan=task.plan.unlimited())
         self._max_attempts = task.plan.max_attempts
         self._num_rows = num_rows
         task = self._task

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from .._programs import at_top_level, compiled, in_one_function, is_known, values_of
+from .._programs import at_top_level, compiled, in_one_function, values_of
 from .._progress import Progress
 from .._results import may_need_newton, RESULTS
 from .._solvers import Newton, RootFinder
@@ -14,6 +14,7 @@ from .._system import AbstractSystem, State
 from .._types import Args, Flag, Real, Scalar
 from ..schemes import AbstractScheme
 from .events import AbstractEvent
+from .experience import Experience
 from .failure import explained_memory_error, raise_failure
 from .inputs import check_halvings, prepare
 from .long_run import checked_options, run_long
@@ -24,7 +25,7 @@ from .stage import is_chord_alone
 from .step_sizes import AbstractController, EqualSteps, find_end
 from .task import Task
 from .watcher import watcher_of
-from .without_jacobian import chord_alone, remember_newton
+from .without_jacobian import chord_alone
 
 
 def simulate(
@@ -135,7 +136,8 @@ def simulate(
         raise TypeError(f"`saveat` must be a `SaveAt`, got {saveat!r}.")
     check_halvings(max_halvings)
     options = checked_options(progress, checkpoint, checkpoint_seconds, resume)
-    start, args, step, begin = prepare(system, scheme, start, args, h, t0, root_finder)
+    prepared = prepare(system, scheme, start, args, h, t0, root_finder)
+    start, args, step, begin, experience = prepared
     end = find_end(num_steps, t1, max_steps, controller, h, t0, step.dtype)
     plan = controller.plan(scheme, step, begin, end)
     longest = plan.max_attempts if options is None else sys.maxsize
@@ -159,7 +161,7 @@ def simulate(
     num_rows = task.saving.num_rows(plan)
     with explained_memory_error(plan.max_attempts):
         if options is None:
-            solution, outcome = _whole(task, num_rows)
+            solution, outcome = _whole(task, num_rows, experience)
             reached, failed = outcome.reached, outcome.failed
         else:
             solution, reached = run_long(task, num_rows, options)
@@ -181,19 +183,19 @@ class _Outcome(NamedTuple):
     needs_newton: Flag
 
 
-def _whole(task: Task, num_rows: int) -> tuple[Solution, _Outcome]:
+def _whole(task: Task, num_rows: int, experience: Experience) -> tuple[Solution, _Outcome]:
     """A run in one piece."""
-    quick = None
+    plan, finder = task.plan, task.root_finder
     values = values_of(task)
     if at_top_level(values):
-        if task.watcher is None and is_known(task):
-            task = dataclasses.replace(task, plan=task.plan.rounded_up())
-        quick = chord_alone(task, values)
-    solution, outcome, alone = _run(task if quick is None else quick)
+        finder = chord_alone(values, experience) or finder
+        if values is task and task.watcher is None:
+            plan = plan.rounded_up()
+    solution, outcome, alone = _run(task._replace(plan=plan, root_finder=finder))
     if alone and values_of(outcome).needs_newton:
-        solution, outcome, _ = _run(task)
-        if not values_of(outcome).failed:
-            remember_newton(values)
+        solution, outcome, _ = _run(task._replace(plan=plan))
+        # Later runs of the system then have Newton's method from the beginning.
+        experience.needs_newton = not values_of(outcome).failed
     if solution.ts.size > num_rows:
         solution = first_rows(solution, num_rows)
     return solution, outcome

@@ -212,7 +212,7 @@ def step(
     **Raises:** `ValueError` or `TypeError` for wrong shapes, types and signs, and for a
     system with events.
     """
-    state, args, h, _ = prepare(system, scheme, state, args, h, t, root_finder)
+    state, args, h, *_ = prepare(system, scheme, state, args, h, t, root_finder)
     check_halvings(max_halvings)
     if system.events:
         raise ValueError(

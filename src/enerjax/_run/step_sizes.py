@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 import sys
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from .._operators import AbstractModel
-from .._programs import is_known
+from .._programs import is_known, module_of
 from .._results import RESULTS
 from .._system import State
 from .._types import Flag, Real, Scalar
@@ -149,17 +149,17 @@ class AbstractController(eqx.Module):
         """The steps of a run that starts at `t0` with a step of length `h`."""
 
 
-class End(eqx.Module):
+class End(NamedTuple):
     """Where a run ends: after `num_steps`, or at the time `t1`.
 
     In a run to `t1`, `needed` is the number of steps of the length `h` to this time, and
     `max_steps` an optional bound on the number of steps.
     """
 
-    num_steps: int | None = eqx.field(static=True, default=None)
+    num_steps: int | None = None
     t1: Scalar | None = None
     needed: Scalar | None = None
-    max_steps: int | None = eqx.field(static=True, default=None)
+    max_steps: int | None = None
 
 
 class EqualSteps(AbstractController):
@@ -170,7 +170,7 @@ class EqualSteps(AbstractController):
 
     def plan(self, scheme: AbstractScheme, h: Scalar, t0: Scalar, end: End) -> "EqualPlan":
         if end.num_steps is not None:
-            number = jnp.asarray(end.num_steps, h.dtype)
+            number = module_of(h, t0).asarray(end.num_steps, h.dtype)
             return EqualPlan(
                 t0=t0,
                 t1=t0 + h * number,
@@ -187,7 +187,7 @@ class EqualSteps(AbstractController):
                 "transformation, the number of steps is not known at compile time. Give a "
                 "bound, such as the number of steps at the shortest `h`."
             )
-        number = jnp.asarray(end.needed, h.dtype)
+        number = module_of(h, t0, end.needed).asarray(end.needed, h.dtype)
         return EqualPlan(
             t0=t0,
             t1=end.t1,
@@ -316,7 +316,7 @@ def find_end(
     if max_steps is not None:
         max_steps = positive_integer("max_steps", max_steps)
     needed: Any = _steps_that_fit(h, t0, t1, dtype)
-    return End(t1=jnp.asarray(t1, dtype), needed=needed, max_steps=max_steps)
+    return End(t1=module_of(t1).asarray(t1, dtype), needed=needed, max_steps=max_steps)
 
 
 def _real(number: Real) -> float:
@@ -328,7 +328,7 @@ def _steps_that_fit(h: Real, t0: Real, t1: Real, dtype: Any) -> Scalar | float:
 
     The result is a NumPy number if all three are known.
     """
-    numbers: Any = np if is_known((h, t0, t1)) else jnp
+    numbers: Any = module_of(h, t0, t1)
     length, begin, end = (numbers.asarray(x, dtype) for x in (h, t0, t1))
     steps, size = (end - begin) / length, abs(end) / length
     rounding = numbers.asarray(16 * jnp.finfo(dtype).eps, dtype)

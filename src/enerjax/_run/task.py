@@ -1,7 +1,7 @@
 """A run with its checked arguments: what its programs have in common."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,7 +23,7 @@ from .step_sizes import AbstractPlan
 from .watcher import Watcher
 
 
-class Task(eqx.Module):
+class Task(NamedTuple):
     """The checked arguments of `simulate`."""
 
     system: AbstractSystem

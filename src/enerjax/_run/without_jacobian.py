@@ -7,9 +7,6 @@ fails in a step, the run is made again with Newton's method too, and if this hel
 all later runs of the system.
 """
 
-import dataclasses
-import functools
-from collections.abc import Hashable
 from typing import Any
 
 import jax
@@ -20,12 +17,12 @@ from .._programs import (
     compiled_for_once,
     is_known,
     jacobian_pattern,
-    structure_of,
     values_of,
 )
 from .._solvers import ChordAlone
 from .._system import AbstractSystem, State, System
 from .._types import Scalar
+from .experience import Experience
 from .loop import dispensable_newton
 from .step import model_for
 from .task import Task
@@ -38,27 +35,13 @@ _CONTRACTS = 0.25
 _PASSES = 10
 
 
-@dataclasses.dataclass
-class _Experience:
-    """What is known of the systems of one structure.
+def chord_alone(task: Task, experience: Experience) -> ChordAlone | None:
+    """The root finder of a program without the exact Jacobian, if that is worth a try.
 
-    - `is_linear`: whether all forces are constant; `None` before the first run.
-    - `needs_newton`: whether a run has failed without Newton's method, and not with it.
+    `task` is a run without derivatives.
     """
-
-    is_linear: bool | None = None
-    needs_newton: bool = False
-
-
-def chord_alone(task: Task, values: Task) -> Task | None:
-    """The same run in a program without the exact Jacobian, if that is worth a try.
-
-    `values` is the task without derivatives.
-    """
-    system = values.system
-    newton = dispensable_newton(
-        values.root_finder, values.scheme, values.plan, values.watcher
-    )
+    system = task.system
+    newton = dispensable_newton(task.root_finder, task.scheme, task.plan, task.watcher)
     if newton is None:
         return None
     is_separable = isinstance(system, System)
@@ -66,36 +49,20 @@ def chord_alone(task: Task, values: Task) -> Task | None:
     if not has_joints and is_separable:
         return None
     # The inertia of an arm is ill-conditioned: single precision leaves too few digits.
-    if not is_separable and values.start.q.dtype == jnp.float32:
+    if not is_separable and task.start.q.dtype == jnp.float32:
         return None
-    experience = _experience(values)
     if experience.needs_newton:
         return None
     if experience.is_linear is None:
-        if _closes_over_unknown_values(system, values):
+        if _closes_over_unknown_values(system, task):
             return None
-        experience.is_linear = is_separable and _is_linear(system, values)
+        experience.is_linear = is_separable and _is_linear(system, task)
     # NaN compares false: such a run fails in any program.
     if not experience.is_linear:
-        contraction = values_of(_contraction(values))
+        contraction = values_of(_contraction(task))
         if bool(contraction > _CONTRACTS):
             return None
-    return dataclasses.replace(task, root_finder=ChordAlone(newton))
-
-
-def remember_newton(task: Task) -> None:
-    """Later runs of the system have Newton's method from the beginning."""
-    _experience(task).needs_newton = True
-
-
-def _experience(task: Task) -> _Experience:
-    structure = structure_of((task.system, task.scheme, task.start, task.args))
-    return _Experience() if structure is None else _remembered(structure)
-
-
-@functools.lru_cache(maxsize=256)
-def _remembered(structure: Hashable) -> _Experience:
-    return _Experience()
+    return ChordAlone(newton)
 
 
 def _closes_over_unknown_values(system: AbstractSystem, task: Task) -> bool:

@@ -86,7 +86,7 @@ def explain(
 
     **Raises:** `ValueError` or `TypeError` for bad input, as `simulate` does.
     """
-    start, args, h, _ = prepare(system, scheme, start, args, 1.0, 0.0, root_finder)
+    start, args, h, *_ = prepare(system, scheme, start, args, 1.0, 0.0, root_finder)
     found: list[Explanation] = []
 
     # Everything is found while this function is traced.

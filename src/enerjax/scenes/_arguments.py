@@ -1,17 +1,11 @@
 """Checks of users' numbers: NumPy arrays for known values, JAX arrays for traced ones."""
 
-from types import ModuleType
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from .._programs import is_known
-
-
-def module_of(*values: Any) -> ModuleType:
-    """`numpy` for known values, so that nothing is compiled; else `jax.numpy`."""
-    return np if is_known(values) else jnp
+from .._programs import is_known, module_of
 
 
 def number(

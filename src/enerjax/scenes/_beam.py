@@ -8,9 +8,9 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from .._programs import compiled_for_once, is_known
+from .._programs import compiled_for_once, is_known, module_of
 from .._types import Real, Vector
-from ._arguments import module_of, velocities
+from ._arguments import velocities
 from ._beam_geometry import along_curve, places_of, Sections, straight, weights_of
 from ._body import AbstractBody
 from ._body_coordinates import AbstractBodyCoordinates, DirectorBodies, PlanarBodies

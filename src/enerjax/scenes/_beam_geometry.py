@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._programs import is_known
-from ._arguments import direction, module_of, number
+from .._programs import is_known, module_of
+from ._arguments import direction, number
 
 
 # Points of a curve per element, at which its length and its directions are found.

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._programs import compiled_for_once, is_known
+from .._programs import compiled_for_once, is_known, module_of
 from .._types import Coordinates, Velocities
-from ._arguments import module_of, number
+from ._arguments import number
 from ._beam_geometry import weights_of
 from ._ends import Ends, Hinge, Hinges
 from ._frames import Frame, GROUND, Numbers

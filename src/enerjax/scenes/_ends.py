@@ -4,8 +4,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._programs import is_known
-from ._arguments import basis, direction, module_of, number
+from .._programs import is_known, module_of
+from ._arguments import basis, direction, number
 from ._frames import Frame, Numbers
 
 

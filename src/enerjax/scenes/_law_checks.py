@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._programs import module_of
 from .._types import Coordinates
-from ._arguments import module_of
 from ._ends import Ends
 from ._frames import Numbers
 from ._functions import pushes

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from .._programs import is_known
-from ._arguments import module_of, number, positive
+from .._programs import is_known, module_of
+from ._arguments import number, positive
 from ._frames import Numbers
 
 

@@ -9,8 +9,9 @@ empty if the body is not to be seen. By default it follows from the joints and t
 see `docs/pictures.md`.
 """
 
+from .._programs import module_of
 from .._types import Real, Vector
-from ._arguments import joined, module_of, number, positive, velocities
+from ._arguments import joined, number, positive, velocities
 from ._beam import Beam as Beam
 from ._body import AbstractBody as AbstractBody
 from ._body_coordinates import (

@@ -8,8 +8,9 @@ the `args` of the system.
 import equinox as eqx
 import numpy as np
 
+from .._programs import module_of
 from .._types import Real, Vector
-from ._arguments import module_of, number
+from ._arguments import number
 from ._beam import Beam
 from ._beam_geometry import weights_of
 from ._ends import Ends

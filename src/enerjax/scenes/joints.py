@@ -20,9 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._programs import is_known
+from .._programs import is_known, module_of
 from .._types import Real, Vector
-from ._arguments import basis, direction, module_of, positive
+from ._arguments import basis, direction, positive
 from ._ends import Ends
 from ._frames import Numbers
 from ._laws import (

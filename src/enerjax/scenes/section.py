@@ -5,9 +5,9 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from .._programs import is_known
+from .._programs import is_known, module_of
 from .._types import Real, Vector
-from ._arguments import module_of, number
+from ._arguments import number
 from ._frames import Numbers
 
 

@@ -16,8 +16,9 @@ import equinox as eqx
 import numpy as np
 from typing_extensions import TypeAliasType
 
+from .._programs import module_of
 from .._types import Real, Vector
-from ._arguments import basis, module_of, number, positive
+from ._arguments import basis, number, positive
 from ._rotations import rotation_matrix
 
 

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..._programs import is_known
+from ..._programs import is_known, module_of
 from ..._types import Args, Real
 from ..base import AbstractSystem, State
 from .shapes import check_shapes
@@ -51,7 +51,7 @@ def check_system(
     check_number("t0` or `t", t)
     if jnp.ndim(t) != 0 or (is_known(t) and not np.isfinite(t)):
         raise ValueError(f"The time of the start must be a finite number, got {t}.")
-    state = State(q, v, jnp.asarray(t, q.dtype) if system.is_timed else None)
+    state = State(q, v, module_of(t).asarray(t, q.dtype) if system.is_timed else None)
     check_shapes(system, state, args)
     if is_known((system, state, args)):
         check_values(system, state, args)

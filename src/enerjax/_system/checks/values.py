@@ -1,9 +1,12 @@
 """Checks of the values of a system: finite energies, a regular inertia."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from ..._programs import call_traced_once, compiled_for_once, is_known
 from ..._solvers import is_positive_definite, scaled_blocks, Symmetric
@@ -19,9 +22,17 @@ def direction_without_symmetry(x: Float[Array, " n"]) -> Float[Array, " n"]:
     return 1 + 0.5 * jnp.cos(jnp.arange(x.size, dtype=x.dtype))
 
 
+# The conditions that the values of a system must satisfy, in the order of their messages.
+_CONDITIONS = (
+    *("start", "args", "potential", "timed", "slope", "constraint", "slopes"),
+    *("nonholonomic", "acts", "depends"),
+    *("inertia", "quadratic", "symmetric", "definite", "rigid", "regular"),
+)
+
+
 @compiled_for_once
-def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]:
-    """The conditions that the values of a system must satisfy, and `all` of them."""
+def _facts(system: AbstractSystem, state: State, args: Args) -> Bool[Array, " conditions"]:
+    """Whether each of `_CONDITIONS` is satisfied, in one array, which is read at once."""
     inertia = system.inertia(state, args)
     blocks, eps = scaled_blocks(inertia), 1e3 * jnp.finfo(inertia.dtype).eps
     finite = lambda tree: jnp.all(
@@ -45,7 +56,7 @@ def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]
         timed.append(call_traced_once(system.force, state.q, state.v, t, args))
     if system.driven is not None and t is not None:
         timed.append(call_traced_once(system.driven, state.q, t, args))
-    facts = dict(
+    facts: dict[str, Any] = dict(
         **_nonholonomic(system, state, args),
         start=finite(state),
         args=finite([x for x in jax.tree.leaves(args) if eqx.is_inexact_array(x)]),
@@ -61,13 +72,13 @@ def _facts(system: AbstractSystem, state: State, args: Args) -> dict[str, Array]
         **_definiteness(system, inertia),
         rigid=_is_rigid(system, state, inertia, args),
     )
-    return facts | dict(all=jnp.all(jnp.stack(list(facts.values()))))
+    return jnp.stack([facts[name] for name in _CONDITIONS])
 
 
 def _nonholonomic(system: AbstractSystem, state: State, args: Args) -> dict[str, Flag]:
     """Whether the rows of the matrix of these constraints are finite, and none is zero."""
     if system.nonholonomic is None:
-        return {}
+        return dict(nonholonomic=jnp.array(True), acts=jnp.array(True))
     matrix = system.nonholonomic(state.q, args)
     return dict(
         nonholonomic=jnp.all(jnp.isfinite(matrix)),
@@ -138,8 +149,8 @@ def check_without_rotations(
         return
     if system.kinematics.with_rotations(state.q, (3,)) is system.kinematics:
         return
-    is_regular = _facts(system, state, args)["regular"]
-    if is_known(is_regular) and not is_regular:
+    facts = _facts(system, state, args)
+    if is_known(facts) and not facts[_CONDITIONS.index("regular")]:
         raise ValueError(
             f"`{scheme}` takes the axes of rigid bodies as coordinates, and a body of this "
             "system is flat: it has no inertia along one of its axes. Give it a thickness, "
@@ -154,7 +165,10 @@ def check_values(system: AbstractSystem, state: State, args: Args) -> None:
     if not is_known(facts):  # the functions of the system close over tracers
         return
     # The messages contain all numbers as text, which takes longer than a short run.
-    if facts["all"]:
+    violated = [
+        name for name, ok in zip(_CONDITIONS, np.asarray(facts), strict=True) if not ok
+    ]
+    if not violated:
         return
     functions = {role: describe(role, fn) for role, fn, _ in energies(system, state, args)}
     kinetic = functions.get("kinetic", functions.get("hamiltonian"))
@@ -162,9 +176,9 @@ def check_values(system: AbstractSystem, state: State, args: Args) -> None:
     messages = _messages_of_start(potential, state, args) | _messages_of_inertia(
         system, kinetic
     )
-    for name, message in messages.items():
-        if not facts.get(name, True):
-            raise ValueError(message)
+    for name in violated:
+        if name in messages:
+            raise ValueError(messages[name])
 
 
 def _messages_of_start(potential: str | None, state: State, args: Args) -> dict[str, str]:
