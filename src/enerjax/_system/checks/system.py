@@ -109,7 +109,7 @@ def _as_array(x: Any, dtype: Any) -> Any:
     (its type is weak). It becomes an ordinary one, because each kind would recompile too.
     """
     if isinstance(x, float | np.floating):
-        return jnp.asarray(x, dtype)
+        return np.asarray(x, dtype)
     if isinstance(x, jax.Array) and jax.typeof(x).weak_type:
-        return jnp.asarray(x, x.dtype)
+        return module_of(x).asarray(x, x.dtype)
     return jnp.asarray(x) if isinstance(x, np.ndarray) else x
