@@ -82,10 +82,10 @@ def prepare(
     check_number("h", h)
     if is_known(h) and np.ndim(h) == 0 and not 0 < float(np.real(h)) < np.inf:
         raise ValueError(f"`h` must be positive and finite, got {h}.")
-    h = module_of(h).asarray(h, start.q.dtype)
-    if h.ndim != 0:
+    step: Scalar = module_of(h).asarray(h, start.q.dtype)
+    if step.ndim != 0:
         raise ValueError(
-            f"`h` must be a scalar, got shape {h.shape}. To sweep it use `jax.vmap`."
+            f"`h` must be a scalar, got shape {step.shape}. To sweep it use `jax.vmap`."
         )
     experience = experience_of(scheme, system, start, args)
     has_rotations = isinstance(scheme.stage, AbstractSchemeWithRotations)
@@ -93,7 +93,8 @@ def prepare(
         check_without_rotations(system, start, args, type(scheme.stage).__name__)
     if is_known((scheme, system, start, args)):
         check_derivatives(scheme, system, start, args, experience)
-    return Prepared(start, args, h, module_of(t).asarray(t, h.dtype), experience)
+    begin: Scalar = module_of(t).asarray(t, step.dtype)
+    return Prepared(start, args, step, begin, experience)
 
 
 def positive_integer(name: str, count: Any) -> int:
