@@ -279,9 +279,9 @@ class AbstractModel(eqx.Module):
     def accelerations(self, state: State) -> tuple[Velocities, Multipliers]:
         """`vdot` (or `pdot`) and `lambda` that satisfy the equations of motion."""
 
-    @abc.abstractmethod
     def multipliers(self, state: State) -> Multipliers:
         """The multipliers `lambda` of `accelerations`."""
+        return self.accelerations(state)[1]
 
     @abc.abstractmethod
     def coordinate(self, q: Coordinates) -> Float[Array, " ncc"]:

@@ -329,6 +329,3 @@ class CanonicalModel(AbstractModel):
         regularisation = self.regularisation(unit.size, unit.dtype)
         multipliers = unit * affine_root(balance, unit, regularisation)
         return -slope - multipliers @ jacobian, multipliers
-
-    def multipliers(self, state: State) -> Multipliers:
-        return self.accelerations(state)[1]
