@@ -278,7 +278,7 @@ FAULTS = (
     Fault(
         "machine code: angles near multiples of a right angle",
         "_programs/machine_code/trigonometry.py",
-        "    rest = b.fma(count, least, rest)\n",
+        "        rest = fma(count, least, rest)\n",
         "",
         "Sines near zero have rounding errors of many units.",
         of("machine_code::test_sine_cosine_and_arctangent"),

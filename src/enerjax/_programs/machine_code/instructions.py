@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from .graph import Node
-from .trigonometry import functions
 
 
 TYPES = {
@@ -29,7 +28,6 @@ class Instructions:
         self.vector, self.declared = vector, declared
         self.lines: list[str] = []
         self._count = 0
-        self._angles: dict[str, list[str]] = {}
 
     def _t(self, dtype: str) -> str:
         kind = TYPES[dtype]
@@ -244,22 +242,7 @@ class Instructions:
         return self._say(f"call {t} {name}({from_type} {x})")
 
     def _call(self, dtype, node, *xs):
-        if dtype == "f8" and node.extra in ("sin", "cos", "atan"):
-            return self._trigonometric(node.extra, *xs)
         return self._called(node.extra, dtype, xs)
-
-    def _trigonometric(self, name: str, x: str) -> str:
-        self.declared.update(functions(self.vector))
-        t = self._t("f8")
-        if name == "atan":
-            return self._say(f"call {t} @arctangent{self.vector}({t} {x})")
-        if x not in self._angles:
-            pair = f"{{ {t}, {t} }}"
-            both = self._say(f"call {pair} @sincos{self.vector}({t} {x})")
-            self._angles[x] = [
-                self._say(f"extractvalue {pair} {both}, {k}") for k in range(2)
-            ]
-        return self._angles[x][name == "cos"]
 
     def _called(self, name, dtype, xs):
         """A function of the library of the machine."""

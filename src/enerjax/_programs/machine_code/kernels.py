@@ -9,6 +9,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, TYPE_CHECKING
 
+from . import trigonometry
 from .graph import Node, Number, Region
 from .instructions import Instructions, TYPES
 from .loops import Scan, WIDTH
@@ -40,6 +41,8 @@ class Kernel(Instructions):
         self.before: list[str] = []
         self.names: dict[Node, str] = {}
         self._found: dict[tuple, str] = {}
+        # Sine and cosine of the angles of which one has been computed.
+        self._angles: dict[str, list[str]] = {}
 
     def text(self, name: str) -> str:
         return self._loop(name) if self.lanes else self._single(name)
@@ -368,6 +371,21 @@ class Kernel(Instructions):
         types = ("b1", dtype, dtype) if op == "select" else (of,) * len(node.operands)
         xs = [self._value(x, t) for x, t in zip(node.operands, types, strict=True)]
         return xs[0] if op == "copy" else self._operation(node, xs)
+
+    def _call(self, dtype: str, node: Node, *xs: str) -> str:
+        if dtype != "f8" or node.extra not in ("sin", "cos", "atan"):
+            return super()._call(dtype, node, *xs)
+        self.declared.update(trigonometry.functions(self.vector))
+        (x,), t = xs, self._t(dtype)
+        if node.extra == "atan":
+            return self._say(f"call {t} @arctangent{self.vector}({t} {x})")
+        if x not in self._angles:
+            pair = f"{{ {t}, {t} }}"
+            both = self._say(f"call {pair} @sincos{self.vector}({t} {x})")
+            self._angles[x] = [
+                self._say(f"extractvalue {pair} {both}, {k}") for k in range(2)
+            ]
+        return self._angles[x][node.extra == "cos"]
 
     def _dynamic(self, node: Node) -> str:
         """Numbers at computed cells."""

@@ -8,7 +8,8 @@ Moshier, 1989). The results are off by less than a unit in the last place.
 """
 
 import functools
-import struct
+
+from .instructions import Instructions
 
 
 # Beyond this angle the library of the machine computes. The multiple of a right angle that
@@ -60,164 +61,129 @@ _TAN_67, _NEAR_ONE = 2.414213562373095048802, 0.66
 @functools.cache
 def functions(width: int) -> tuple[str, ...]:
     """`sincos` and `arctangent` of so many numbers, and the functions that they call."""
-    real = f"<{width} x double>" if width > 1 else "double"
-    suffix = f"v{width}f64" if width > 1 else "f64"
-    counts = {"fma": 3, "fabs": 1, "copysign": 2}
-    declared = [
-        f"declare {real} @llvm.{name}.{suffix}({', '.join([real] * count)})"
-        for name, count in counts.items()
-    ]
-    declared += [f"declare double @{name}(double) #1" for name in ("sin", "cos")]
-    if width > 1:
-        declared.append(f"declare i1 @llvm.vector.reduce.or.v{width}i1(<{width} x i1>)")
-    return (*declared, _sincos(width), _arctangent(width))
+    declared: set[str] = set()
+    texts = _Body(width, declared).sincos(), _Body(width, declared).arctangent()
+    return (*sorted(declared), *texts)
 
 
-class _Body:
-    """Writes the body of a function of `width` numbers `%x`."""
+class _Body(Instructions):
+    """Writes a function of `%x`, in numbers that are not contracted to fewer roundings."""
 
-    def __init__(self, width: int):
-        self.width = width
-        wide = lambda kind: f"<{width} x {kind}>" if width > 1 else kind
-        self.real, self.whole, self.flag = map(wide, ("double", "i64", "i1"))
-        self.pair = f"{{ {self.real}, {self.real} }}"
-        self.suffix = f"v{width}f64" if width > 1 else "f64"
-        self.lines: list[str] = []
+    def __init__(self, width: int, declared: set[str]):
+        super().__init__(width, declared)
+        self._real, self._whole = self._t("f8"), self._t("i8")
+        self._pair = f"{{ {self._real}, {self._real} }}"
 
-    def say(self, text: str) -> str:
-        name = f"%v{len(self.lines)}"
-        self.lines.append(f"  {name} = {text}")
-        return name
+    def sincos(self) -> str:
+        """Returns the sine and the cosine."""
+        size = self._abs("f8", None, "%x")
+        # Infinite angles and NaN are far too.
+        far = self._say(f"fcmp uge {self._real} {size}, {self._number(_LARGE)}")
+        if self.vector > 1:
+            any_of, flags = f"@llvm.vector.reduce.or.v{self.vector}i1", self._t("b1")
+            self.declared.add(f"declare i1 {any_of}({flags})")
+            far = self._say(f"call i1 {any_of}({flags} {far})")
+        self.lines += [f"  br i1 {far}, label %far, label %near", "near:"]
+        self._return_both(*self._sine_and_cosine())
+        self.lines.append("far:")
+        self._return_both(*(self._called(name, "f8", ["%x"]) for name in ("sin", "cos")))
+        return self._text(self._pair, "sincos")
 
-    def known(self, x: float) -> str:
-        text = f"0x{struct.unpack('<Q', struct.pack('<d', x))[0]:016X}"
-        return f"splat (double {text})" if self.width > 1 else text
+    def _sine_and_cosine(self) -> tuple[str, str]:
+        op, fma, known = self._op, self._fma, self._number
+        shifted = fma("%x", known(_PER_RIGHT_ANGLE), known(_ROUNDING))
+        count = op("fsub", shifted, known(_ROUNDING))
+        most, more, least = (known(-part) for part in _RIGHT_ANGLE)
+        coarse = fma(count, most, "%x")
+        # Their sum is the angle: `rest` has the rounding errors.
+        part = op("fmul", count, more)
+        angle = op("fadd", coarse, part)
+        rest = op("fadd", op("fsub", coarse, angle), part)
+        rest = op("fadd", rest, fma(count, more, self._neg("f8", None, part)))
+        rest = fma(count, least, rest)
+        square = op("fmul", angle, angle)
+        cube = op("fmul", angle, square)
+        sine = op("fadd", angle, fma(self._polynomial(square, _SINE), cube, rest))
+        # Zero keeps its sign.
+        sine = self._intrinsic("copysign", "f8", sine, angle)
+        half = op("fmul", square, known(0.5))
+        near_one = op("fsub", known(1.0), half)
+        left = op("fsub", op("fsub", known(1.0), near_one), half)
+        left = op("fsub", left, op("fmul", angle, rest))
+        fourth = op("fmul", square, square)
+        left = fma(self._polynomial(square, _COSINE), fourth, left)
+        cosine = op("fadd", near_one, left)
+        # The quadrant is in the last two bits. A cosine is a sine in the next quadrant.
+        quadrant = self._as_bits(shifted)
+        odd = self._is_set(self._bitwise("and", quadrant, 1))
+        after = self._bitwise("add", quadrant, 1)
+        return (
+            self._with_sign_of(self._either(odd, cosine, sine), quadrant),
+            self._with_sign_of(self._either(odd, sine, cosine), after),
+        )
 
-    def op(self, name: str, a: str, b: str) -> str:
-        return self.say(f"{name} {self.real} {a}, {b}")
+    def _with_sign_of(self, x: str, quadrant: str) -> str:
+        """`x`, or `-x` in the third and fourth quadrants."""
+        sign = self._bitwise("shl", self._bitwise("and", quadrant, 2), 62)
+        bits = self._say(f"xor {self._whole} {self._as_bits(x)}, {sign}")
+        return self._say(f"bitcast {self._whole} {bits} to {self._real}")
 
-    def bitwise(self, name: str, a: str, b: int | str) -> str:
-        """An operation on whole numbers."""
-        b = f"splat (i64 {b})" if isinstance(b, int) and self.width > 1 else str(b)
-        return self.say(f"{name} {self.whole} {a}, {b}")
+    def arctangent(self) -> str:
+        op, known, either = self._op, self._number, self._either
+        size = self._abs("f8", None, "%x")
+        steep = self._say(f"fcmp ogt {self._real} {size}, {known(_TAN_67)}")
+        middle = self._say(f"fcmp ogt {self._real} {size}, {known(_NEAR_ONE)}")
+        # The arctangent of -1 / x is a right angle less, that of (x - 1) / (x + 1) half of
+        # it.
+        one, zero = known(1.0), known(0.0)
+        above = either(steep, known(-1.0), either(middle, op("fsub", size, one), size))
+        below = either(steep, size, either(middle, op("fadd", size, one), one))
+        x = op("fdiv", above, below)
+        square = op("fmul", x, x)
+        ratio = op("fdiv", *(self._polynomial(square, c) for c in _ARCTANGENT))
+        angle = self._fma(op("fmul", x, square), ratio, x)
+        main, rest = (
+            either(steep, known(part), either(middle, known(0.5 * part), zero))
+            for part in _RIGHT_ANGLE[:2]
+        )
+        angle = op("fadd", main, op("fadd", angle, rest))
+        signed = self._intrinsic("copysign", "f8", angle, "%x")
+        self.lines.append(f"  ret {self._real} {signed}")
+        return self._text(self._real, "arctangent")
 
-    def is_set(self, x: str) -> str:
-        zero = "0" if self.width == 1 else "zeroinitializer"
-        return self.say(f"icmp ne {self.whole} {x}, {zero}")
+    def _number(self, x: float) -> str:
+        return self._known(x, "f8")
 
-    def call(self, name: str, *xs: str) -> str:
-        given = ", ".join(f"{self.real} {x}" for x in xs)
-        return self.say(f"call {self.real} @llvm.{name}.{self.suffix}({given})")
+    def _op(self, name: str, a: str, b: str) -> str:
+        return self._say(f"{name} {self._real} {a}, {b}")
 
-    def fma(self, a: str, b: str, c: str) -> str:
-        return self.call("fma", a, b, c)
+    def _fma(self, a: str, b: str, c: str) -> str:
+        return self._intrinsic("fma", "f8", a, b, c)
 
-    def polynomial(self, x: str, coefficients: tuple[float, ...]) -> str:
-        *rest, total = map(self.known, coefficients)
+    def _polynomial(self, x: str, coefficients: tuple[float, ...]) -> str:
+        *rest, total = map(self._number, coefficients)
         for c in reversed(rest):
-            total = self.fma(total, x, c)
+            total = self._fma(total, x, c)
         return total
 
-    def select(self, which: str, a: str, b: str) -> str:
-        return self.say(f"select {self.flag} {which}, {self.real} {a}, {self.real} {b}")
+    def _either(self, which: str, a: str, b: str) -> str:
+        return self._select("f8", None, which, a, b)
 
-    def as_bits(self, x: str) -> str:
-        return self.say(f"bitcast {self.real} {x} to {self.whole}")
+    def _as_bits(self, x: str) -> str:
+        return self._say(f"bitcast {self._real} {x} to {self._whole}")
 
-    def as_real(self, x: str) -> str:
-        return self.say(f"bitcast {self.whole} {x} to {self.real}")
+    def _bitwise(self, name: str, a: str, b: int) -> str:
+        """An operation on whole numbers."""
+        return self._say(f"{name} {self._whole} {a}, {self._known(b, 'i8')}")
 
-    def each(self, function: str, x: str) -> str:
-        """A function of the library of the machine, one number at a time."""
-        if self.width == 1:
-            return self.say(f"call double @{function}(double {x})")
-        out = "poison"
-        for k in range(self.width):
-            one = self.say(f"extractelement {self.real} {x}, i64 {k}")
-            one = self.say(f"call double @{function}(double {one})")
-            out = self.say(f"insertelement {self.real} {out}, double {one}, i64 {k}")
-        return out
+    def _is_set(self, x: str) -> str:
+        return self._say(f"icmp ne {self._whole} {x}, {self._known(0, 'i8')}")
 
-    def both(self, a: str, b: str) -> None:
-        """Returns two results."""
-        first = self.say(f"insertvalue {self.pair} poison, {self.real} {a}, 0")
-        pair = self.say(f"insertvalue {self.pair} {first}, {self.real} {b}, 1")
-        self.lines.append(f"  ret {self.pair} {pair}")
+    def _return_both(self, a: str, b: str) -> None:
+        first = self._say(f"insertvalue {self._pair} poison, {self._real} {a}, 0")
+        pair = self._say(f"insertvalue {self._pair} {first}, {self._real} {b}, 1")
+        self.lines.append(f"  ret {self._pair} {pair}")
 
-    def text(self, result: str, name: str) -> str:
-        head = f"define internal {result} @{name}{self.width}({self.real} %x) #0 {{"
+    def _text(self, result: str, name: str) -> str:
+        head = f"define internal {result} @{name}{self.vector}({self._real} %x) #0 {{"
         return "\n".join([head, "entry:", *self.lines, "}", ""])
-
-
-def _sincos(width: int) -> str:
-    b = _Body(width)
-    size = b.call("fabs", "%x")
-    # Infinite angles and NaN are far too.
-    far = b.say(f"fcmp uge {b.real} {size}, {b.known(_LARGE)}")
-    if width > 1:
-        far = b.say(f"call i1 @llvm.vector.reduce.or.v{width}i1({b.flag} {far})")
-    b.lines += [f"  br i1 {far}, label %far, label %near", "near:"]
-    b.both(*_sine_and_cosine(b))
-    b.lines.append("far:")
-    b.both(b.each("sin", "%x"), b.each("cos", "%x"))
-    return b.text(b.pair, "sincos")
-
-
-def _sine_and_cosine(b: _Body) -> tuple[str, str]:
-    shifted = b.fma("%x", b.known(_PER_RIGHT_ANGLE), b.known(_ROUNDING))
-    count = b.op("fsub", shifted, b.known(_ROUNDING))
-    most, more, least = (b.known(-part) for part in _RIGHT_ANGLE)
-    coarse = b.fma(count, most, "%x")
-    # Their sum is the angle: `rest` has the rounding errors.
-    part = b.op("fmul", count, more)
-    angle = b.op("fadd", coarse, part)
-    rest = b.op("fadd", b.op("fsub", coarse, angle), part)
-    rest = b.op("fadd", rest, b.fma(count, more, b.say(f"fneg {b.real} {part}")))
-    rest = b.fma(count, least, rest)
-    square = b.op("fmul", angle, angle)
-    cube = b.op("fmul", angle, square)
-    sine = b.op("fadd", angle, b.fma(b.polynomial(square, _SINE), cube, rest))
-    # Zero keeps its sign.
-    sine = b.call("copysign", sine, angle)
-    half = b.op("fmul", square, b.known(0.5))
-    near_one = b.op("fsub", b.known(1.0), half)
-    left = b.op("fsub", b.op("fsub", b.known(1.0), near_one), half)
-    left = b.op("fsub", left, b.op("fmul", angle, rest))
-    fourth = b.op("fmul", square, square)
-    cosine = b.op("fadd", near_one, b.fma(b.polynomial(square, _COSINE), fourth, left))
-    # The quadrant is in the last two bits. A cosine is a sine in the next quadrant.
-    quadrant = b.as_bits(shifted)
-    odd = b.is_set(b.bitwise("and", quadrant, 1))
-    after = b.bitwise("add", quadrant, 1)
-    return (
-        _with_sign_of(b, b.select(odd, cosine, sine), quadrant),
-        _with_sign_of(b, b.select(odd, sine, cosine), after),
-    )
-
-
-def _with_sign_of(b: _Body, x: str, quadrant: str) -> str:
-    """`x`, or `-x` in the third and fourth quadrants."""
-    sign = b.bitwise("shl", b.bitwise("and", quadrant, 2), 62)
-    return b.as_real(b.bitwise("xor", b.as_bits(x), sign))
-
-
-def _arctangent(width: int) -> str:
-    b = _Body(width)
-    size = b.call("fabs", "%x")
-    steep = b.say(f"fcmp ogt {b.real} {size}, {b.known(_TAN_67)}")
-    middle = b.say(f"fcmp ogt {b.real} {size}, {b.known(_NEAR_ONE)}")
-    # The arctangent of -1 / x is a right angle less, that of (x - 1) / (x + 1) half of it.
-    one, zero = b.known(1.0), b.known(0.0)
-    above = b.select(steep, b.known(-1.0), b.select(middle, b.op("fsub", size, one), size))
-    below = b.select(steep, size, b.select(middle, b.op("fadd", size, one), one))
-    x = b.op("fdiv", above, below)
-    square = b.op("fmul", x, x)
-    ratio = b.op("fdiv", *(b.polynomial(square, c) for c in _ARCTANGENT))
-    angle = b.fma(b.op("fmul", x, square), ratio, x)
-    main, rest = (
-        b.select(steep, b.known(part), b.select(middle, b.known(0.5 * part), zero))
-        for part in _RIGHT_ANGLE[:2]
-    )
-    angle = b.op("fadd", main, b.op("fadd", angle, rest))
-    b.lines.append(f"  ret {b.real} {b.call('copysign', angle, '%x')}")
-    return b.text(b.real, "arctangent")
