@@ -7,20 +7,18 @@ fails in a step, the run is made again with Newton's method too, and if this hel
 all later runs of the system.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
 from .._operators import SeparableModel
 from .._programs import (
+    call_traced_once,
     compiled_for_once,
-    is_known,
     jacobian_pattern,
     values_of,
 )
 from .._solvers import ChordAlone
-from .._system import AbstractSystem, State, System
+from .._system import closes_over_traced_values, System
 from .._types import Scalar
 from .experience import Experience
 from .loop import dispensable_newton
@@ -54,7 +52,8 @@ def chord_alone(task: Task, experience: Experience) -> ChordAlone | None:
     if experience.needs_newton:
         return None
     if experience.is_linear is None:
-        if _closes_over_unknown_values(system, task):
+        # The result of such a run is traced, so nobody could know whether it has failed.
+        if closes_over_traced_values(system, task.start, task.args):
             return None
         experience.is_linear = is_separable and _is_linear(system, task)
     # NaN compares false: such a run fails in any program.
@@ -65,34 +64,11 @@ def chord_alone(task: Task, experience: Experience) -> ChordAlone | None:
     return ChordAlone(newton)
 
 
-def _closes_over_unknown_values(system: AbstractSystem, task: Task) -> bool:
-    """Whether a function of the system has a value in its closure that is not known now.
-
-    The result of such a run is traced, so it cannot be known whether the run has failed.
-    """
-    start, args = task.start, task.args
-    t = jnp.zeros((), start.q.dtype)
-
-    def found_by(q: jax.Array, v: jax.Array) -> Any:
-        found: list[Any] = [system.energy(State(q, v), args)]
-        if system.constraint is not None:
-            found.append(system.constraint(q, args))
-        if system.driven is not None:
-            found.append(system.driven(q, t, args))
-        if system.force is not None:
-            found.append(system.force(q, v, t, args))
-        if system.nonholonomic is not None:
-            found.append(system.nonholonomic(q, args))
-        return found
-
-    return not is_known(values_of(jax.make_jaxpr(found_by)(start.q, start.v).consts))
-
-
 def _is_linear(system: System, task: Task) -> bool:
     """Whether there is no force but constant ones, such as gravity."""
     if system.force is not None:
         return False
-    slope = jax.grad(lambda q: system.potential(q, task.args))
+    slope = jax.grad(lambda q: call_traced_once(system.potential, q, task.args))
     pattern = jacobian_pattern(slope, task.start.q)
     return pattern is not None and pattern.nnz == 0
 

@@ -18,6 +18,7 @@ from .checks.system import (
 )
 from .checks.values import (
     check_without_rotations as check_without_rotations,
+    closes_over_traced_values as closes_over_traced_values,
     direction_without_symmetry as direction_without_symmetry,
 )
 from .elements import Elements as Elements

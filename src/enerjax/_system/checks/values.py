@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..._programs import call_traced_once, compiled_for_once, is_known
+from ..._programs import call_traced_once, compiled_for_once, is_known, values_of
 from ..._solvers import is_positive_definite, scaled_blocks, Symmetric
 from ..._types import Args, Flag
 from ..base import AbstractSystem, State
@@ -139,6 +139,11 @@ def _is_rigid(
         return jnp.array(True)
     energy = lambda v: system.kinetic_energy(State(state.q, v), args)
     return system.kinematics.has_inertia(energy, inertia)
+
+
+def closes_over_traced_values(system: AbstractSystem, state: State, args: Args) -> bool:
+    """Whether a function of the system has a value in its closure that is not known now."""
+    return not is_known(values_of(_facts(system, state, args)))
 
 
 def check_without_rotations(
