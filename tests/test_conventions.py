@@ -157,7 +157,7 @@ def test_schemes_know_no_solver():
         ("from .._solvers import inverse", "inverse"),
         ("from .._solvers.linear.cholesky_eigh import eigh as e", "eigh"),
         ("def late():\n    from .._solvers import cholesky", "cholesky"),
-        ("from .._operators.separable import product", "product"),
+        ("from .._operators.separable import schur", "schur"),
         ("from .. import _solvers", "*"),
         ("from enerjax import _solvers", "*"),
         ("import enerjax._solvers as s", "*"),

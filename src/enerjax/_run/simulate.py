@@ -158,13 +158,12 @@ def simulate(
         max_halvings=max_halvings,
         watcher=watcher,
     )
-    num_rows = task.saving.num_rows(plan)
     with explained_memory_error(plan.max_attempts):
         if options is None:
-            solution, outcome = _whole(task, num_rows, experience)
+            solution, outcome = _whole(task, experience)
             reached, failed = outcome.reached, outcome.failed
         else:
-            solution, reached = run_long(task, num_rows, options)
+            solution, reached = run_long(task, saving.num_rows(plan), options)
             failed = solution.result != RESULTS.successful
     if not throw:
         return solution
@@ -183,7 +182,7 @@ class _Outcome(NamedTuple):
     needs_newton: Flag
 
 
-def _whole(task: Task, num_rows: int, experience: Experience) -> tuple[Solution, _Outcome]:
+def _whole(task: Task, experience: Experience) -> tuple[Solution, _Outcome]:
     """A run in one piece."""
     plan, finder = task.plan, task.root_finder
     values = values_of(task)
@@ -196,6 +195,7 @@ def _whole(task: Task, num_rows: int, experience: Experience) -> tuple[Solution,
         solution, outcome, _ = _run(task._replace(plan=plan))
         # Later runs of the system then have Newton's method from the beginning.
         experience.needs_newton = not values_of(outcome).failed
+    num_rows = task.saving.num_rows(task.plan)
     if solution.ts.size > num_rows:
         solution = first_rows(solution, num_rows)
     return solution, outcome

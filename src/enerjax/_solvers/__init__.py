@@ -19,7 +19,6 @@ from .linear.dense import (
     inverse as inverse,
     product as product,
     SMALL as SMALL,
-    solve as solve,
     solve_definite as solve_definite,
 )
 from .linear.independent_blocks import (
