@@ -102,6 +102,24 @@ def test_the_motion_is_that_of_the_independent_constraints(scheme):
     assert np.max(np.abs(run.audit.constraint_rate)) <= 2e-11
 
 
+def test_accelerations_satisfy_redundant_constraints():
+    system, args = _beam(4, redundant=True)
+    state = _start(system, args)
+    found = ej.consistent_start(system, state.q, state.v, args)
+    assert system.constraint is not None
+    rows = lambda q: system.constraint(q, args)
+    rate = lambda q, v: jax.jvp(rows, (q,), (v,))[1]
+    change = jax.jvp(rate, (state.q, state.v), (state.v, found.accelerations))[1]
+    np.testing.assert_allclose(change, 0, atol=1e-13)  # round-off of numbers of some 10
+    # The bars turn alike, as a pendulum.
+    up = state.q[:2]
+    free = jnp.array([0, -G])
+    expected = free - (free @ up + state.v[:2] @ state.v[:2]) * up
+    np.testing.assert_allclose(
+        found.accelerations, jnp.tile(expected, 2), rtol=0, atol=1e-13
+    )
+
+
 @pytest.mark.slow
 def test_multipliers_are_of_least_norm():
     system, args = _beam(4, redundant=True)

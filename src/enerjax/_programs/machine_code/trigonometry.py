@@ -67,7 +67,8 @@ def functions(width: int) -> tuple[str, ...]:
 
 
 class _Body(Instructions):
-    """Writes a function of `%x`, in numbers that are not contracted to fewer roundings."""
+    """Writes a function of `%x`; unlike those of kernels, its operations stay as they are,
+    because it computes their rounding errors."""
 
     def __init__(self, width: int, declared: set[str]):
         super().__init__(width, declared)
