@@ -23,14 +23,6 @@ FAULTS = (
         of("initial::test_known_velocities_are_kept_in_a_nearly_singular_pose"),
     ),
     Fault(
-        "accelerations: two passes with redundant constraints",
-        "_operators/separable.py",
-        "range(5 if self.system.redundant else 2)",
-        "range(2)",
-        "Accelerations violate redundant constraints by what makes them regular.",
-        of("redundant::test_accelerations_satisfy_redundant_constraints"),
-    ),
-    Fault(
         "projection: one correction of momenta",
         "_analysis/projection.py",
         "8 if isinstance(model.system, HamiltonianSystem) else 1",

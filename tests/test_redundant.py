@@ -120,6 +120,27 @@ def test_accelerations_satisfy_redundant_constraints():
     )
 
 
+@pytest.mark.parametrize("difference", [1e-2, 1e-3])
+def test_constraints_that_differ_little_have_the_forces_of_both(difference):
+    """The force along the third axis is that which holds the point in the plane."""
+    masses = np.array([1.0, 3.0, 1.0])
+    weights = masses * np.cos(np.arange(3.0))
+    system = ej.System(
+        np.diag(masses),
+        lambda q, args: G * q @ weights,
+        lambda q, args: jnp.array([q @ q - 1, q @ q - 1 + difference * q[2]]),
+        redundant=True,
+    )
+    q, v = jnp.array([0.6, 0.8, 0.0]), jnp.array([-0.8, 0.6, 0.0])
+    found = ej.consistent_start(system, q, v)
+    assert system.constraint is not None
+    jacobian = jax.jacfwd(lambda q: system.constraint(q, None))(q)
+    # What makes the equations regular, over the square of the difference.
+    np.testing.assert_allclose(
+        found.multipliers @ jacobian[:, 2], -G * weights[2], rtol=1e-8 / difference**2
+    )
+
+
 @pytest.mark.slow
 def test_multipliers_are_of_least_norm():
     system, args = _beam(4, redundant=True)

@@ -140,6 +140,30 @@ def simulate_pendulum(num_steps, g=9.81, **options):
     )
 
 
+@pytest.mark.parametrize("transform", [jax.grad, lambda f: jax.vmap(f, axis_size=1)])
+def test_traced_numbers_in_closures_with_rows_that_are_cut(transform):
+    """Three steps are made by the program for four."""
+
+    def end(stiffness, num_steps=3):
+        system = ej.System(
+            jnp.eye(2),
+            lambda q, args: 9.81 * q[1] + 0.5 * jnp.sum(stiffness) * q[0] ** 2,
+            lambda q, args: jnp.array([q @ q - 1]),
+        )
+        begin = ej.State(jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]))
+        sol = ej.simulate(system, ej.EnergyPreserving(), begin, h=0.01, num_steps=num_steps)
+        return sol.ys.q[3, 0]
+
+    found, whole = transform(end), transform(lambda x: end(x, 4))
+    at = jnp.array([1.2]) if transform is not jax.grad else jnp.array(1.2)
+    np.testing.assert_array_equal(found(at), whole(at))
+
+
+def test_results_of_equal_calls_are_equally_free_to_move():
+    committed = [simulate_pendulum(11).ys.q.committed for _ in range(3)]
+    assert committed == [False] * 3
+
+
 def test_runs_share_a_program_up_to_the_next_power_of_two(caplog):
     longest = simulate_pendulum(16)
     simulate_pendulum(14)

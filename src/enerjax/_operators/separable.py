@@ -482,9 +482,7 @@ class SeparableModel(AbstractModel):
         if gyroscopic is not None:
             slope = slope + gyroscopic
         free_rate = self._free_joint_acceleration(state, qdot)
-        # A flat body has no inertia along one of its axes, if these are its coordinates.
-        has_axes = jax.eval_shape(self.kinematics.constraint, q).size > 0
-        if self.has_delassus_matrix and not has_axes and self._frames(q) is None:
+        if self._has_independent_accelerations(q):
             return self._independent_accelerations(state, slope, free_rate)
         unit = 1 / self.kinematics.velocity_scale(self.inertia)
 
@@ -515,6 +513,17 @@ class SeparableModel(AbstractModel):
         added = self.regularisation_after(like[:first], num_joints)
         return parts(affine_root(conditions, like, added))
 
+    def _has_independent_accelerations(self, q: Coordinates) -> bool:
+        """Whether accelerations follow from the inverse inertia and the Delassus matrix.
+
+        Not so where the axes of bodies are coordinates, because a flat body has no inertia
+        along one of them; nor where constraints may be redundant, because the part of the
+        Delassus matrix that makes it regular may exceed its small eigenvalues.
+        """
+        has_axes = jax.eval_shape(self.kinematics.constraint, q).size > 0
+        is_regular = self.has_delassus_matrix and not self.system.redundant
+        return is_regular and not has_axes and self._frames(q) is None
+
     def _independent_accelerations(
         self, state: State, slope: Increments, free_rate: JointMultipliers
     ) -> tuple[Velocities, Multipliers]:
@@ -527,10 +536,9 @@ class SeparableModel(AbstractModel):
         delassus = self.delassus_matrix(state)
         acceleration = -(self.inverse_inertia @ slope)
         multipliers = jnp.zeros_like(free_rate)
-        # The second pass repairs the round-off of the first, which is large where constraints
-        # are nearly dependent. With a regularisation each pass leaves a part of the error of
-        # about 1e-4.
-        for _ in range(5 if self.system.redundant else 2):
+        # The second pass repairs the round-off of the first, which is large where
+        # constraints are nearly dependent.
+        for _ in range(2):
             rate = delassus.product(acceleration) + free_rate
             (more,) = delassus.solve(rate[None])
             acceleration = acceleration - delassus.velocity(more)

@@ -16,6 +16,7 @@ from .counting import num_operations as num_operations
 from .digest import checksum as checksum, digest as digest
 from .hashable_indices import Indices as Indices
 from .jaxprs import (
+    as_array as as_array,
     evaluate as evaluate,
     function_with_own_derivative as function_with_own_derivative,
     interpret as interpret,

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._programs import is_known, module_of
+from .._programs import as_array, is_known
 from .._solvers import RootFinder
 from .._system import (
     AbstractSystem,
@@ -33,7 +33,7 @@ class Prepared(NamedTuple):
 
     - `start`, `args`: the start, and `args` as arrays.
     - `h`, `t`: the length of a step and the time of the start in the dtype of the start;
-      NumPy numbers if they are known.
+      those that the user gives as numbers of Python or NumPy are NumPy's.
     - `experience`: what earlier calls have shown of the system.
     """
 
@@ -82,7 +82,7 @@ def prepare(
     check_number("h", h)
     if is_known(h) and np.ndim(h) == 0 and not 0 < float(np.real(h)) < np.inf:
         raise ValueError(f"`h` must be positive and finite, got {h}.")
-    step: Scalar = module_of(h).asarray(h, start.q.dtype)
+    step = as_array(h, start.q.dtype)
     if step.ndim != 0:
         raise ValueError(
             f"`h` must be a scalar, got shape {step.shape}. To sweep it use `jax.vmap`."
@@ -93,8 +93,7 @@ def prepare(
         check_without_rotations(system, start, args, type(scheme.stage).__name__)
     if is_known((scheme, system, start, args)):
         check_derivatives(scheme, system, start, args, experience)
-    begin: Scalar = module_of(t).asarray(t, step.dtype)
-    return Prepared(start, args, step, begin, experience)
+    return Prepared(start, args, step, as_array(t, step.dtype), experience)
 
 
 def positive_integer(name: str, count: Any) -> int:

@@ -193,8 +193,9 @@ def _whole(task: Task, experience: Experience) -> tuple[Solution, _Outcome]:
     solution, outcome, alone = _run(task._replace(plan=plan, root_finder=finder))
     if alone and values_of(outcome).needs_newton:
         solution, outcome, _ = _run(task._replace(plan=plan))
-        # Later runs of the system then have Newton's method from the beginning.
-        experience.needs_newton = not values_of(outcome).failed
+        if not values_of(outcome).failed:
+            # Later runs of the system have Newton's method from the beginning.
+            experience.needs_newton = True
     num_rows = task.saving.num_rows(task.plan)
     if solution.ts.size > num_rows:
         solution = first_rows(solution, num_rows)

@@ -206,36 +206,42 @@ class Solution(eqx.Module):
 
 
 def first_rows(solution: Solution, count: int) -> Solution:
-    """The solution without the rows after the first `count` rows."""
+    """The solution without the rows after the first `count` rows.
+
+    Of every array with one entry for each row, or for each step, as many last ones go.
+    """
     names = "ts", "ys", "multipliers", "details", "audit", "stats"
     rows = {name: getattr(solution, name) for name in names}
     excess = solution.ts.size - count
-    # By NumPy: XLA would compile a program for each `count`, in a fifth of a second.
-    cut = lambda x: np.asarray(x)[: len(x) - excess] if x.ndim > 0 else x
-    rows = _as_arrays(jax.tree.map(cut, rows), solution.ts)
-    return dataclasses.replace(solution, **rows)
+    cut = lambda x: x[: len(x) - excess] if x.ndim > 0 else x
+    if not is_known(rows):  # the functions of the system close over tracers
+        return dataclasses.replace(solution, **jax.tree.map(cut, rows))
+    # By NumPy: the program by which XLA cuts rows takes 54 ms to compile for each `count`.
+    rows = jax.tree.map(lambda x: cut(np.asarray(x)), rows)
+    return dataclasses.replace(solution, **_moved(rows, solution.ts))
 
 
-def _as_arrays(tree: PyTree[np.ndarray], like: Array) -> PyTree[Array]:
-    """NumPy arrays as arrays on the device of the array `like`."""
-    shapes = tuple(x.shape for x in jax.tree.leaves(tree))
-    calls = _calls_with(shapes)
-    calls[0] += 1
-    # JAX takes 20 us for each array. A program takes 100 us for all, but its compilation
-    # 14 ms, which pays for shapes that come again.
-    if calls[0] == 1 or len(like.devices()) > 1:
+def _moved(tree: PyTree[np.ndarray], like: Array) -> PyTree[Array]:
+    """NumPy arrays as arrays of JAX on the device of the array `like`."""
+    if like.committed or len(like.devices()) > 1:
         return jax.device_put(tree, like.sharding)
     with jax.default_device(*like.devices()):
-        return _first_rows_of(tree)
+        # JAX takes 20 us for each array. A program takes 100 us for all, but 14 ms to
+        # compile, which pays for shapes that come again.
+        types = tuple((x.shape, x.dtype) for x in jax.tree.leaves(tree))
+        is_first = not _has_moved(types)[0]
+        _has_moved(types)[0] = True
+        return jax.device_put(tree) if is_first else _first_rows_moved(tree)
 
 
 @functools.lru_cache(maxsize=256)
-def _calls_with(shapes: tuple[tuple[int, ...], ...]) -> list[int]:
-    return [0]
+def _has_moved(types: tuple[Any, ...]) -> list[bool]:
+    """Whether arrays of these types have been moved before, which the caller writes."""
+    return [False]
 
 
 @jax.jit
-def _first_rows_of(tree: PyTree[Array]) -> PyTree[Array]:
+def _first_rows_moved(tree: PyTree[Array]) -> PyTree[Array]:
     return tree
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from .._operators import AbstractModel
-from .._programs import is_known, module_of
+from .._programs import as_array, is_known, module_of
 from .._results import RESULTS
 from .._system import State
 from .._types import Flag, Real, Scalar
@@ -316,7 +316,7 @@ def find_end(
     if max_steps is not None:
         max_steps = positive_integer("max_steps", max_steps)
     needed: Any = _steps_that_fit(h, t0, t1, dtype)
-    return End(t1=module_of(t1).asarray(t1, dtype), needed=needed, max_steps=max_steps)
+    return End(t1=as_array(t1, dtype), needed=needed, max_steps=max_steps)
 
 
 def _real(number: Real) -> float:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..._programs import is_known, module_of
+from ..._programs import as_array, is_known
 from ..._types import Args, Real
 from ..base import AbstractSystem, State
 from .shapes import check_shapes
@@ -51,7 +51,7 @@ def check_system(
     check_number("t0` or `t", t)
     if jnp.ndim(t) != 0 or (is_known(t) and not np.isfinite(t)):
         raise ValueError(f"The time of the start must be a finite number, got {t}.")
-    state = State(q, v, module_of(t).asarray(t, q.dtype) if system.is_timed else None)
+    state = State(q, v, as_array(t, q.dtype) if system.is_timed else None)
     check_shapes(system, state, args)
     if is_known((system, state, args)):
         check_values(system, state, args)
@@ -109,7 +109,7 @@ def _as_array(x: Any, dtype: Any) -> Any:
     (its type is weak). It becomes an ordinary one, because each kind would recompile too.
     """
     if isinstance(x, float | np.floating):
-        return np.asarray(x, dtype)
+        return as_array(x, dtype)
     if isinstance(x, jax.Array) and jax.typeof(x).weak_type:
-        return module_of(x).asarray(x, x.dtype)
+        return jnp.asarray(x, x.dtype)
     return jnp.asarray(x) if isinstance(x, np.ndarray) else x

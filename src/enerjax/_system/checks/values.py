@@ -23,16 +23,19 @@ def direction_without_symmetry(x: Float[Array, " n"]) -> Float[Array, " n"]:
 
 
 # The conditions that the values of a system must satisfy, in the order of their messages.
+# `check_without_rotations` has the message of the last one.
 _CONDITIONS = (
-    *("start", "args", "potential", "timed", "slope", "constraint", "slopes"),
-    *("nonholonomic", "acts", "depends"),
-    *("inertia", "quadratic", "symmetric", "definite", "rigid", "regular"),
-)
+    "start args potential timed slope constraint slopes nonholonomic acts depends "
+    "inertia quadratic symmetric definite rigid regular"
+).split()
 
 
 @compiled_for_once
 def _facts(system: AbstractSystem, state: State, args: Args) -> Bool[Array, " conditions"]:
-    """Whether each of `_CONDITIONS` is satisfied, in one array, which is read at once."""
+    """Whether each of `_CONDITIONS` is satisfied.
+
+    All functions of the user are called here; see `closes_over_traced_values`.
+    """
     inertia = system.inertia(state, args)
     blocks, eps = scaled_blocks(inertia), 1e3 * jnp.finfo(inertia.dtype).eps
     finite = lambda tree: jnp.all(
@@ -142,7 +145,10 @@ def _is_rigid(
 
 
 def closes_over_traced_values(system: AbstractSystem, state: State, args: Args) -> bool:
-    """Whether a function of the system has a value in its closure that is not known now."""
+    """Whether a function of the system has a value in its closure that is not known now.
+
+    What follows from the values of all functions is then traced too.
+    """
     return not is_known(values_of(_facts(system, state, args)))
 
 
