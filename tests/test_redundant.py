@@ -106,8 +106,9 @@ def test_accelerations_satisfy_redundant_constraints():
     system, args = _beam(4, redundant=True)
     state = _start(system, args)
     found = ej.consistent_start(system, state.q, state.v, args)
-    assert system.constraint is not None
-    rows = lambda q: system.constraint(q, args)
+    constraint = system.constraint
+    assert constraint is not None
+    rows = lambda q: constraint(q, args)
     rate = lambda q, v: jax.jvp(rows, (q,), (v,))[1]
     change = jax.jvp(rate, (state.q, state.v), (state.v, found.accelerations))[1]
     np.testing.assert_allclose(change, 0, atol=1e-13)  # round-off of numbers of some 10
@@ -133,8 +134,9 @@ def test_constraints_that_differ_little_have_the_forces_of_both(difference):
     )
     q, v = jnp.array([0.6, 0.8, 0.0]), jnp.array([-0.8, 0.6, 0.0])
     found = ej.consistent_start(system, q, v)
-    assert system.constraint is not None
-    jacobian = jax.jacfwd(lambda q: system.constraint(q, None))(q)
+    constraint = system.constraint
+    assert constraint is not None
+    jacobian = jax.jacfwd(lambda q: constraint(q, None))(q)
     # What makes the equations regular, over the square of the difference.
     np.testing.assert_allclose(
         found.multipliers @ jacobian[:, 2], -G * weights[2], rtol=1e-8 / difference**2
