@@ -23,6 +23,10 @@ from .step_sizes import AbstractPlan
 from .watcher import Watcher
 
 
+# States of so many coordinates are observed one after the other.
+_MANY = 64
+
+
 class Task(NamedTuple):
     """The checked arguments of `simulate`."""
 
@@ -141,7 +145,9 @@ class Task(NamedTuple):
         if self.observes_in_loop:
             ys, measured = rows.kept
         else:
-            ys, measured = jax.vmap(observe)(rows.kept, rows.ts, rows.varying)
+            # Rows are lanes where the entries of one row are too few for that.
+            each = jax.vmap if self.start.q.size < _MANY else _one_after_the_other
+            ys, measured = each(observe)(rows.kept, rows.ts, rows.varying)
         of_user = lambda x: self._without_gaps(model, self.start.q, x)
         return Solution(
             ts=rows.ts,
@@ -161,3 +167,8 @@ class Task(NamedTuple):
             result=end.result,
             names=self.system.names,
         )
+
+
+def _one_after_the_other(fn: Callable[..., PyTree[Any]]) -> Callable[..., PyTree[Any]]:
+    """Like `vmap`, by a loop, whose code does not grow with the number of rows."""
+    return lambda *rows: jax.lax.map(lambda row: fn(*row), rows)

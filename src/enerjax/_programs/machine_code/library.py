@@ -109,7 +109,8 @@ def _function(cellar: Cellar, inputs: list, outputs: list) -> Function:
     tables = [emission.addresses(x) if np.any(x >= CONSTANTS) else x for x in cellar.tables]
     # One more, because kernels may read the cell behind a number.
     size = 8 * (cellar.num_constants + cellar.size + 1)
-    handler = (PASSES if emission.has_passes else _WITHOUT_PASSES) + _HANDLER
+    passes = PASSES if emission.has_passes else _WITHOUT_PASSES
+    handler = _NEW_MEMORY[sys.platform == "linux"] + passes + _HANDLER
     for key, value in {
         "SIZE": size,
         "WIDE": WIDTH * size,
@@ -245,6 +246,38 @@ def _helpers() -> str:
     return "\n".join(out)
 
 
+# Memory for the numbers of a program. Linux is asked for large pages (`MADV_HUGEPAGE`):
+# steps of large systems read from more places than the processor knows the small pages of.
+_NEW_MEMORY = {
+    False: """
+declare ptr @malloc(i64)
+define internal ptr @new_memory(i64 %size) {
+  %m = call ptr @malloc(i64 %size)
+  ret ptr %m
+}
+""",
+    True: """
+declare ptr @malloc(i64)
+declare ptr @aligned_alloc(i64, i64)
+declare i32 @madvise(ptr, i64, i32)
+define internal ptr @new_memory(i64 %size) {
+entry:
+  %is_large = icmp uge i64 %size, 4194304
+  br i1 %is_large, label %large, label %small
+large:
+  %more = add i64 %size, 2097151
+  %pages = and i64 %more, -2097152
+  %l = call ptr @aligned_alloc(i64 2097152, i64 %pages)
+  %ignored = call i32 @madvise(ptr %l, i64 %pages, i32 14)
+  ret ptr %l
+small:
+  %s = call ptr @malloc(i64 %size)
+  ret ptr %s
+}
+""",
+}
+
+
 # The function that XLA calls, by the interface of `xla/ffi/api/c_api.h`: the offsets are
 # those of its structures. In a first call it is asked for the version of the interface, and
 # answers with the one that it is called by.
@@ -254,7 +287,6 @@ define internal ptr @passes_memory() {
 }
 """
 _HANDLER = """
-declare ptr @malloc(i64)
 declare void @free(ptr)
 declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)
 define ptr @handler(ptr %frame) {
@@ -274,7 +306,7 @@ answer:
   store i64 %version, ptr %a3
   ret ptr null
 work:
-  %m = call ptr @malloc(i64 $SIZE$)
+  %m = call ptr @new_memory(i64 $SIZE$)
   %c = inttoptr i64 $C$ to ptr
   call void @llvm.memcpy.p0.p0.i64(ptr %m, ptr %c, i64 $CONSTANTS$, i1 false)
   %w = call ptr @passes_memory()

@@ -38,7 +38,7 @@ end:
 }}
 
 define internal ptr @passes_memory() #0 {{
-  %w = call ptr @malloc(i64 $WIDE$)
+  %w = call ptr @new_memory(i64 $WIDE$)
   call void @widened(ptr inttoptr (i64 $C$ to ptr), ptr %w, i64 $NUMBER$)
   ret ptr %w
 }}

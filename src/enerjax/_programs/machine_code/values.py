@@ -131,7 +131,8 @@ class Cellar:
         self.num_constants = 1
         self._constant_starts = [0]
         self._constant_places: dict[Any, int] = {}
-        self._arrays = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        # The starts and the lanes of the owners, with room for more.
+        self._numbers = np.zeros((2, 64), np.int64)
         # Whether some cells have a number for each of several passes.
         self.has_passes = False
         self._read_before: dict[tuple[bytes, str], Number] = {}
@@ -143,8 +144,13 @@ class Cellar:
 
     def new(self, count: int, owner: Node | Block) -> int:
         """The first of so many new cells."""
+        last = len(self._owners)
         self._starts.append(self.size)
         self._owners.append(owner)
+        if last == self._numbers.shape[1]:
+            self._numbers = np.concatenate([self._numbers, 0 * self._numbers], axis=1)
+        is_reduced = isinstance(owner, Node) and owner.is_reduced
+        self._numbers[:, last] = self.size, 1 if is_reduced else owner.lanes or 1
         self.size += count
         return self._starts[-1]
 
@@ -375,9 +381,9 @@ class Cellar:
         """
         is_constant = places >= CONSTANTS
         safe = np.where(is_constant, 0, places)
-        starts = self._start_array()
+        starts, lanes = self._numbers[:, : len(self._owners)]
         owner = np.searchsorted(starts, safe, side="right") - 1
-        lanes = self._lane_array()[owner]
+        lanes = lanes[owner]
         offset = safe - starts[owner]
         column = np.where(
             lanes >= _FEWEST_LANES, starts[owner] + offset - offset % lanes, -1
@@ -401,24 +407,6 @@ class Cellar:
             return None
         return whole, others
 
-    def _start_array(self) -> np.ndarray:
-        self._refresh()
-        return self._arrays[0]
-
-    def _lane_array(self) -> np.ndarray:
-        return self._arrays[1]
-
-    def _refresh(self) -> None:
-        """The owners as arrays, which are made anew after some more have come."""
-        if self._arrays[0].size != len(self._starts):
-            known = self._arrays[0].size
-            new = self._owners[known:]
-            lanes = [1 if getattr(x, "is_reduced", False) else x.lanes or 1 for x in new]
-            self._arrays = (
-                np.append(self._arrays[0], self._starts[known:]).astype(np.int64),
-                np.append(self._arrays[1], lanes).astype(np.int64),
-            )
-
     def _all_owners(self, places: np.ndarray) -> list[Node | Block]:
         last = int(places.max(initial=-1))
         if last >= CONSTANTS:
@@ -429,9 +417,10 @@ class Cellar:
         low = bisect.bisect_right(self._starts, int(places.min())) - 1
         high = bisect.bisect_right(self._starts, last) - 1
         if high - low > 1:
-            starts = np.array(self._starts[low : high + 1])
-            numbers = np.unique(np.searchsorted(starts, places, side="right") - 1)
-            return [self._owners[low + k] for k in numbers]
+            starts = self._numbers[0, low : high + 1]
+            is_owner = np.zeros(starts.size, bool)
+            is_owner[np.searchsorted(starts, places, side="right") - 1] = True
+            return [self._owners[low + k] for k in np.flatnonzero(is_owner)]
         return self._owners[low : high + 1]
 
     # Conversions --------------------------------------------------------------------------
