@@ -24,7 +24,7 @@ from .watcher import Watcher
 
 
 # States of so many coordinates are observed one after the other.
-_MANY = 64
+_MANY = 128
 
 
 class Task(NamedTuple):
