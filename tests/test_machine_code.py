@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from jax.ad_checkpoint import checkpoint_name
 
+import enerjax as ej
 from enerjax._programs import at_places, in_one_function, why_not_one_function
 from enerjax._programs.machine_code import emission, graph, library, loops, scheduling
 from enerjax._solvers.linear.dense import Inverse
@@ -954,6 +955,28 @@ def test_a_long_branch_is_compiled_when_it_is_taken(monkeypatch):
     xs = jnp.linspace(-2, 1, 600).reshape(200, 3)
     batch = jax.jit(jax.vmap(in_one_function(long_branch)))
     np.testing.assert_allclose(batch(xs), jax.vmap(long_branch)(xs), rtol=0, atol=1e-12)
+
+
+def test_code_of_a_large_system_hardly_grows_with_its_rows(monkeypatch):
+    texts = []
+    add = library._Library.add
+
+    def count(self, name, parts, *others):
+        texts.append(sum(map(len, parts)))
+        return add(self, name, parts, *others)
+
+    monkeypatch.setattr(library._Library, "add", count)
+    problem = ej.problems.chain(70)
+    sizes = []
+    for num_steps in (30, 250):
+        texts.clear()
+        run = (problem.system, ej.EnergyPreserving(), problem.start, problem.args)
+        ej.simulate(*run, h=1e-4, num_steps=num_steps)
+        sizes.append(sum(texts))
+    few, many = sizes
+    assert few > 0
+    # Only rows that are not reached are replaced together: 1.3, and otherwise 1.8.
+    assert many <= 1.5 * few
 
 
 def test_an_interrupt_while_a_branch_is_compiled_comes_after_it(monkeypatch):
