@@ -9,7 +9,16 @@ import numpy as np
 
 from ..numpy_primitives import is_inside
 from .graph import Node, Number
-from .values import dtype_of, lane_of, Memory, MOST_CELLS, objects, Unsupported, Value
+from .values import (
+    columns_along,
+    dtype_of,
+    lane_of,
+    Memory,
+    MOST_CELLS,
+    objects,
+    Unsupported,
+    Value,
+)
 
 
 if TYPE_CHECKING:
@@ -48,7 +57,7 @@ def _at_computed(
     n = sizes[lane]
     kept = list(sizes)
     kept[lane] = 1
-    columns = np.moveaxis(first, lane, -1).reshape(-1, n)
+    columns = columns_along(first, lane)
     flat = [self.dynamic(x[0], int(x[1] - x[0]), offset, dtype, n, memory) for x in columns]
     return self.cells(dtype, objects(flat, tuple(kept)), lane, n)
 

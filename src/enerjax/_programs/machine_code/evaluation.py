@@ -24,6 +24,7 @@ from .small_matrices import in_plain_operations, is_small
 from .values import (
     Cellar,
     Cells,
+    columns_along,
     CONSTANTS,
     dtype_of,
     lane_of,
@@ -308,7 +309,7 @@ class Evaluation:
         for axis in range(numbers.ndim):
             if numbers.shape[axis] != n:
                 continue
-            columns = np.moveaxis(numbers, axis, -1).reshape(-1, n)
+            columns = columns_along(numbers, axis)
             in_order = np.all(lane[columns] == np.arange(n), axis=1)
             same = np.all(cell[columns] == cell[columns[:, :1]], axis=1)
             whole = in_order & same

@@ -17,6 +17,7 @@ from .values import (
     Block,
     Carried,
     Cells,
+    columns_along,
     dtype_of,
     has_constants_among_others,
     Memory,
@@ -197,9 +198,8 @@ def _numbers(
     if lane is None:
         numbers = self.cellar.unlaned(value).ravel().tolist()
         return numbers, places.ravel().tolist()
-    n = value.shape[lane]
     numbers = self.cellar.laned(value, lane).ravel().tolist()
-    return numbers, list(np.moveaxis(places, lane, -1).reshape(-1, n))
+    return numbers, list(columns_along(places, lane))
 
 
 def _is_in_place(self: "Evaluation", x: Node, at: Any) -> bool:
@@ -230,8 +230,7 @@ def _block(
     first = self.cellar.size
     parts: list[np.ndarray] = []
     if isinstance(value, Cells) and value.lane is not None:
-        turned = np.moveaxis(np.arange(size).reshape(shape), value.lane, -1)
-        parts = list(turned.reshape(-1, value.n))
+        parts = list(columns_along(np.arange(size).reshape(shape), value.lane))
     elif isinstance(value, Memory):
         found = self.cellar.columns(value.places.ravel())
         parts = [] if found is None else [*found[0], *([found[1]] if found[1].size else [])]
@@ -243,8 +242,7 @@ def _block(
         elif lane is None:
             parts = [np.arange(size)]
         else:
-            turned = np.moveaxis(np.arange(size).reshape(shape), lane, -1)
-            parts = list(turned.reshape(-1, shape[lane]))
+            parts = list(columns_along(np.arange(size).reshape(shape), lane))
     owners = []
     whole = np.concatenate(parts)
     places[whole] = first + np.arange(size)
@@ -540,7 +538,7 @@ def _row(self: "Evaluation", x: Value, counter: Node) -> Value:
     n = shape[lane]
     kept = list(shape)
     kept[lane] = 1
-    columns = np.moveaxis(first, lane, -1).reshape(-1, n)
+    columns = columns_along(first, lane)
     steps = np.diff(columns, axis=1)
     if not np.all(steps == steps[:, :1]):
         flat_row = [self.dynamic(p, 0, offset, x.dtype, 0, x) for p in first.ravel()]

@@ -445,10 +445,10 @@ class Cellar:
         kept = list(value.shape)
         kept[lane] = 1
         if isinstance(value, Memory):
-            columns = np.moveaxis(value.places, lane, -1).reshape(-1, value.shape[lane])
+            columns = columns_along(value.places, lane)
             flat = [self.lanes_at(x, value.dtype) for x in columns]
             return objects(flat, tuple(kept))
-        columns = np.moveaxis(value, lane, -1).reshape(-1, value.shape[lane])
+        columns = columns_along(value, lane)
         flat = [self._known_lanes(x) for x in columns]
         return objects(flat, tuple(kept))
 
@@ -546,6 +546,15 @@ def usual_lane(shape: tuple[int, ...]) -> int | None:
     if longest < _FEWEST_LANES or (size <= _SMALL and longest < _MANY):
         return None
     return shape.index(longest)
+
+
+def columns_along(x: np.ndarray, axis: int) -> np.ndarray:
+    """The entries of an array along an axis, shape `(columns, n)`.
+
+    `np.moveaxis` takes four times as long, and a program asks for thousands of them.
+    """
+    last = [*range(axis), *range(axis + 1, x.ndim), axis]
+    return x.transpose(last).reshape(-1, x.shape[axis])
 
 
 def objects(flat: list[Any], shape: tuple[int, ...]) -> np.ndarray:
