@@ -258,21 +258,23 @@ define internal ptr @new_memory(i64 %size) {
 """,
     True: """
 declare ptr @malloc(i64)
-declare ptr @aligned_alloc(i64, i64)
 declare i32 @madvise(ptr, i64, i32)
 define internal ptr @new_memory(i64 %size) {
 entry:
+  %m = call ptr @malloc(i64 %size)
   %is_large = icmp uge i64 %size, 4194304
-  br i1 %is_large, label %large, label %small
+  br i1 %is_large, label %large, label %end
 large:
-  %more = add i64 %size, 2097151
-  %pages = and i64 %more, -2097152
-  %l = call ptr @aligned_alloc(i64 2097152, i64 %pages)
-  %ignored = call i32 @madvise(ptr %l, i64 %pages, i32 14)
-  ret ptr %l
-small:
-  %s = call ptr @malloc(i64 %size)
-  ret ptr %s
+  %begin = ptrtoint ptr %m to i64
+  %after = add i64 %begin, 4095
+  %first = and i64 %after, -4096
+  %stop = add i64 %begin, %size
+  %length = sub i64 %stop, %first
+  %pages = inttoptr i64 %first to ptr
+  %ignored = call i32 @madvise(ptr %pages, i64 %length, i32 14)
+  br label %end
+end:
+  ret ptr %m
 }
 """,
 }
