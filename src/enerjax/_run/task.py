@@ -23,7 +23,8 @@ from .step_sizes import AbstractPlan
 from .watcher import Watcher
 
 
-# States of so many coordinates are observed one after the other.
+# States of so many coordinates are observed one after the other: vectors are then along the
+# coordinates, and the code would have a copy for every row.
 _MANY = 128
 
 
@@ -145,7 +146,6 @@ class Task(NamedTuple):
         if self.observes_in_loop:
             ys, measured = rows.kept
         else:
-            # Rows are lanes where the entries of one row are too few for that.
             each = jax.vmap if self.start.q.size < _MANY else _one_after_the_other
             ys, measured = each(observe)(rows.kept, rows.ts, rows.varying)
         of_user = lambda x: self._without_gaps(model, self.start.q, x)

@@ -109,9 +109,10 @@ def _function(cellar: Cellar, inputs: list, outputs: list) -> Function:
     tables = [emission.addresses(x) if np.any(x >= CONSTANTS) else x for x in cellar.tables]
     # One more, because kernels may read the cell behind a number.
     size = 8 * (cellar.num_constants + cellar.size + 1)
-    passes = PASSES if emission.has_passes else _WITHOUT_PASSES
-    handler = _NEW_MEMORY[sys.platform == "linux"] + passes + _HANDLER
+    handler = (PASSES if emission.has_passes else _WITHOUT_PASSES) + _HANDLER
+    has_large_pages = sys.platform == "linux" and size >= _LARGE
     for key, value in {
+        "LARGE_PAGES": _WITH_LARGE_PAGES if has_large_pages else "",
         "SIZE": size,
         "WIDE": WIDTH * size,
         "NUMBER": constants.size,
@@ -246,38 +247,19 @@ def _helpers() -> str:
     return "\n".join(out)
 
 
-# Memory for the numbers of a program. Linux is asked for large pages (`MADV_HUGEPAGE`):
-# steps of large systems read from more places than the processor knows the small pages of.
-_NEW_MEMORY = {
-    False: """
-declare ptr @malloc(i64)
-define internal ptr @new_memory(i64 %size) {
-  %m = call ptr @malloc(i64 %size)
-  ret ptr %m
-}
-""",
-    True: """
-declare ptr @malloc(i64)
-declare i32 @madvise(ptr, i64, i32)
-define internal ptr @new_memory(i64 %size) {
-entry:
-  %m = call ptr @malloc(i64 %size)
-  %is_large = icmp uge i64 %size, 4194304
-  br i1 %is_large, label %large, label %end
-large:
+# Asks Linux for large pages of the memory (`MADV_HUGEPAGE`) from its first whole page on.
+# Without them, the steps of large systems read from more pages than the processor can look
+# up quickly.
+_WITH_LARGE_PAGES = """
   %begin = ptrtoint ptr %m to i64
   %after = add i64 %begin, 4095
   %first = and i64 %after, -4096
-  %stop = add i64 %begin, %size
+  %stop = add i64 %begin, $SIZE$
   %length = sub i64 %stop, %first
   %pages = inttoptr i64 %first to ptr
-  %ignored = call i32 @madvise(ptr %pages, i64 %length, i32 14)
-  br label %end
-end:
-  ret ptr %m
-}
-""",
-}
+  %ignored = call i32 @madvise(ptr %pages, i64 %length, i32 14)"""
+# The memory, in bytes, from which on it has large pages.
+_LARGE = 4 << 20
 
 
 # The function that XLA calls, by the interface of `xla/ffi/api/c_api.h`: the offsets are
@@ -289,6 +271,8 @@ define internal ptr @passes_memory() {
 }
 """
 _HANDLER = """
+declare ptr @malloc(i64)
+declare i32 @madvise(ptr, i64, i32)
 declare void @free(ptr)
 declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)
 define ptr @handler(ptr %frame) {
@@ -308,7 +292,7 @@ answer:
   store i64 %version, ptr %a3
   ret ptr null
 work:
-  %m = call ptr @new_memory(i64 $SIZE$)
+  %m = call ptr @malloc(i64 $SIZE$)$LARGE_PAGES$
   %c = inttoptr i64 $C$ to ptr
   call void @llvm.memcpy.p0.p0.i64(ptr %m, ptr %c, i64 $CONSTANTS$, i1 false)
   %w = call ptr @passes_memory()

@@ -131,8 +131,9 @@ class Cellar:
         self.num_constants = 1
         self._constant_starts = [0]
         self._constant_places: dict[Any, int] = {}
-        # The starts and the lanes of the owners, with room for more.
-        self._numbers = np.zeros((2, 64), np.int64)
+        # The first cells and the lanes of the owners, for many cells at once, with room for
+        # more owners.
+        self._owner_table = np.zeros((2, 64), np.int64)
         # Whether some cells have a number for each of several passes.
         self.has_passes = False
         self._read_before: dict[tuple[bytes, str], Number] = {}
@@ -147,10 +148,11 @@ class Cellar:
         last = len(self._owners)
         self._starts.append(self.size)
         self._owners.append(owner)
-        if last == self._numbers.shape[1]:
-            self._numbers = np.concatenate([self._numbers, 0 * self._numbers], axis=1)
+        if last == self._owner_table.shape[1]:
+            table = self._owner_table
+            self._owner_table = np.concatenate([table, np.zeros_like(table)], axis=1)
         is_reduced = isinstance(owner, Node) and owner.is_reduced
-        self._numbers[:, last] = self.size, 1 if is_reduced else owner.lanes or 1
+        self._owner_table[:, last] = self.size, 1 if is_reduced else owner.lanes or 1
         self.size += count
         return self._starts[-1]
 
@@ -381,7 +383,7 @@ class Cellar:
         """
         is_constant = places >= CONSTANTS
         safe = np.where(is_constant, 0, places)
-        starts, lanes = self._numbers[:, : len(self._owners)]
+        starts, lanes = self._owner_table[:, : len(self._owners)]
         owner = np.searchsorted(starts, safe, side="right") - 1
         lanes = lanes[owner]
         offset = safe - starts[owner]
@@ -417,7 +419,7 @@ class Cellar:
         low = bisect.bisect_right(self._starts, int(places.min())) - 1
         high = bisect.bisect_right(self._starts, last) - 1
         if high - low > 1:
-            starts = self._numbers[0, low : high + 1]
+            starts = self._owner_table[0, low : high + 1]
             is_owner = np.zeros(starts.size, bool)
             is_owner[np.searchsorted(starts, places, side="right") - 1] = True
             return [self._owners[low + k] for k in np.flatnonzero(is_owner)]

@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from ..._programs import at_places
 from .dense import definite_inverse
@@ -301,7 +301,7 @@ def _entries_of_round(
     changes = _changes_of_entries(blocks, step, couplings.shape)
     changed = blocks.sorted(np.array(list(changes), int))
     used = np.concatenate([pivots.ravel(), couplings.ravel(), changed])
-    after = np.concatenate([changed, blocks.sorted(_without(before, used, place.size))])
+    after = np.concatenate([changed, blocks.sorted(before[~np.isin(before, used)])])
     depth, width, _, count = couplings.shape
     none = depth * (depth + 1) // 2 * width * width * count
     terms = _padded([changes[k] for k in changed], none)
@@ -330,7 +330,7 @@ def _rows_of_round(
         changes.setdefault(int(near.flat[at]), []).append(int(at))
     changed = np.array(list(changes), int)
     used = np.concatenate([mine.ravel(), changed])
-    after = np.concatenate([changed, np.sort(_without(before, used, place.size))])
+    after = np.concatenate([changed, np.sort(before[~np.isin(before, used)])])
     others = Sums(place[after], _padded(list(changes.values()), near.size))
     place_after = np.full(blocks.count + 1, after.size)
     place_after[after] = np.arange(after.size)
@@ -359,15 +359,6 @@ def _changes_of_entries(
                     at = int(products[pair, a, b, p])
                     entries.setdefault(int(block[a, b]), []).append(at)
     return entries
-
-
-def _without(
-    numbers: Int[np.ndarray, " n"], others: Int[np.ndarray, " k"], size: int
-) -> Int[np.ndarray, " m"]:
-    """The numbers that are not among others, all below a size."""
-    is_kept = np.ones(size, bool)
-    is_kept[others] = False
-    return numbers[is_kept[numbers]]
 
 
 def _padded(lists: list[list[int]], none: int) -> np.ndarray:
