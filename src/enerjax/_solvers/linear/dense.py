@@ -6,6 +6,7 @@ from compiling the loop around it into a single function.
 
 import abc
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -54,6 +55,54 @@ def _inverse_jvp(primals, tangents):
     (x,), (dx,) = primals, tangents
     y = inverse(x)
     return y, -product(product(y, dx), y)
+
+
+@jax.jit
+def inverse_by_cofactors(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """The inverse of up to four rows, without pivots; not finite where it is singular.
+
+    Its relative error is round-off times `s1^2 / (s_(n-1) s_n)`, with the singular values
+    in their order, where pivoting has `s1 / s_n`. Scales of rows and columns do not matter.
+    """
+    if len(matrix) == 1:
+        return 1 / matrix
+    rows = list(matrix)
+    of_rows = jnp.stack(_COFACTORS[len(matrix)](*rows))
+    return of_rows.T / (rows[0] @ of_rows[0])
+
+
+def _cofactors_of_2(a: Array, b: Array) -> list[Array]:
+    return [jnp.stack([b[1], -b[0]]), jnp.stack([-a[1], a[0]])]
+
+
+def _cofactors_of_3(a: Array, b: Array, c: Array) -> list[Array]:
+    after, before = np.array([1, 2, 0]), np.array([2, 0, 1])
+    cross = lambda x, y: x[after] * y[before] - x[before] * y[after]
+    return [cross(b, c), cross(c, a), cross(a, b)]
+
+
+def _cofactors_of_4(a: Array, b: Array, c: Array, d: Array) -> list[Array]:
+    first, last = _minors(a, b), _minors(c, d)
+    of = lambda x, minors: jnp.sum(x[_OTHERS] * minors, axis=1)
+    return [of(b, last), -of(a, last), of(d, first), -of(c, first)]
+
+
+def _minors(a: Array, b: Array) -> Float[Array, "4 3"]:
+    """For each column and each of the others, the signed minor of the remaining two."""
+    left, right = np.triu_indices(4, 1)
+    minors = a[left] * b[right] - a[right] * b[left]
+    return jnp.concatenate([minors, -minors])[_MINORS]
+
+
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+# The minors of the columns 01, 02, 03, 12, 13 and 23, and then their negatives.
+_MINORS = np.array([[5, 10, 3], [11, 2, 7], [4, 8, 0], [9, 1, 6]])
+
+_COFACTORS: dict[int, Callable[..., list[Array]]] = {
+    2: _cofactors_of_2,
+    3: _cofactors_of_3,
+    4: _cofactors_of_4,
+}
 
 
 def eliminated(
