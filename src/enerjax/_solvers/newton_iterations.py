@@ -49,6 +49,7 @@ _LEAST_FRACTION = 0.01
 class Powers(NamedTuple):
     """Thresholds that depend on the precision: powers of the machine epsilon.
 
+    - `of_unknowns`: a correction below this is round-off, like the residual of `round_off`.
     - `floor`: a correction of an unknown is measured relative to that unknown plus this
       fraction of the largest unknown.
     - `small`: a correction or a residual below this is in the range of convergence.
@@ -61,6 +62,7 @@ class Powers(NamedTuple):
     """
 
     eps: float
+    of_unknowns: float
     floor: float
     small: float
     moderate: float
@@ -75,13 +77,15 @@ _FEW = 64
 def powers_of(x: Float[Array, " n"]) -> Powers:
     """The thresholds for the precision and the number of the unknowns."""
     eps = float(jnp.finfo(x.dtype).eps)
+    growth = max(x.size / _FEW, 1)
     return Powers(
         eps=eps,
+        of_unknowns=eps * growth,
         floor=eps**0.125,
         small=eps**0.25,
         moderate=eps**0.5,
         tiny=eps**0.75,
-        round_off=min(eps**0.875 * max(x.size / _FEW, 1), eps**0.75),
+        round_off=min(eps**0.875 * growth, eps**0.75),
     )
 
 
@@ -300,16 +304,17 @@ def _classify(
     # before. It also uses at least the size of that correction, because the exact Jacobian
     # has changed by an amount of this size.
     rate = jnp.maximum(jnp.maximum(contraction, iterate.contraction), iterate.size)
-    converged = size * rate <= newton.rtol * powers.eps
+    converged = size * rate <= newton.rtol * powers.of_unknowns
     converged = ~fresh & shrinks & converged & (defect <= powers.small)
     is_root = (defect <= newton.atol * powers.eps) & small
-    # Corrections with one Jacobian that have decreased and stop decreasing are round-off.
-    met = ~fresh & ~shrinks & (iterate.contraction > 0)
-    # So are larger ones, such as those of stiff forces, if they decrease no more at once. A
-    # Jacobian that is not exact contracts at a constant rate. The motion of a light body
-    # can converge slowly after that of a heavy one, so the correction must be tiny too.
+    # Larger corrections, such as those of stiff forces, are round-off if they decrease far
+    # less at once. A Jacobian that is not exact contracts at a constant rate. The motion of
+    # a light body can converge slowly after that of a heavy one, so the correction must be
+    # tiny too.
     ends_at_once = iterate.accurate & (contraction > _AT_ONCE * iterate.contraction)
-    ends_at_once = ends_at_once & (size <= powers.tiny)
+    ends_at_once = ends_at_once & (contraction > _SHRINKS_FAST) & (size <= powers.tiny)
+    # Corrections with one Jacobian that have decreased and stop decreasing are round-off.
+    met = ~fresh & (~shrinks | ends_at_once) & (iterate.contraction > 0)
     bound = jnp.where(ends_at_once, _OF_STIFF_FORCES, 1) * powers.round_off
     met = met & (defect <= bound) & small
     # A small correction with a new Jacobian that is not smaller than the one before is

@@ -443,7 +443,6 @@ def _library() -> _Library:
     return _Library()
 
 
-@functools.cache
 @contextlib.contextmanager
 def _orders_quickly(llvm: Any, length: int) -> Iterator[None]:
     """Options of LLVM for a long text. They hold for the whole process, so they do not stay.
@@ -462,6 +461,7 @@ def _orders_quickly(llvm: Any, length: int) -> Iterator[None]:
             llvm.set_option("", option)
 
 
+@functools.cache
 def _llvm() -> Any:
     import llvmlite.binding as llvm
 
