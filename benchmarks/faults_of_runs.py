@@ -104,7 +104,7 @@ FAULTS = (
     Fault(
         "search: round-off of large systems as that of small ones",
         "_solvers/newton_iterations.py",
-        "round_off=min(eps**0.875 * max(x.size / _FEW, 1), eps**0.75)",
+        "round_off=min(eps**0.875 * growth, eps**0.75)",
         "round_off=eps**0.875",
         "Long chains call Newton's method at a residual that is round-off.",
         of("chord::test_what_is_round_off_grows_with_the_system"),
