@@ -649,6 +649,24 @@ def test_loops_do_not_gather_what_they_do_not_change():
     assert not any(gathers)
 
 
+@pytest.mark.parametrize("lanes", [64, 512, 513])
+def test_lanes_of_many_numbers_spread_over_the_cache(lanes):
+    """32 lines at a time do not fit into the 8 places that a multiple of 4 kB has."""
+    program = jax.make_jaxpr(lambda x: jnp.cumsum(jnp.sin(x), axis=1))(
+        jnp.ones((lanes, 32))
+    )
+    cellar, _, _ = library.graph_of(program.jaxpr, [None])
+    numbers = [
+        node
+        for region in scheduling.all_regions(cellar.graph.root)
+        for node in region.found.values()
+        if node.op == "call"
+    ]
+    assert len(numbers) == 32
+    lines = [cellar.place_of(node, "f8") // 8 % 64 for node in numbers]
+    assert max(lines.count(line) for line in lines) <= 2
+
+
 def is_gather(x):
     """Whether a number of lanes is read from cells that are not neighbours."""
     is_read = isinstance(x, graph.Node) and x.op == "load" and x.lanes
