@@ -447,7 +447,8 @@ def _library() -> _Library:
 def _orders_quickly(llvm: Any, length: int) -> Iterator[None]:
     """Options of LLVM for a long text.
 
-    They hold for the whole process, so they do not stay. A thread that compiles at the same time gets right code of either order.
+    They hold for the whole process, so they do not stay. A thread that compiles at the same
+    time gets right code of either order.
     """
     if length < _LONG_TEXT or llvm.llvm_version_info[0] > _KNOWN_LLVM:
         yield
