@@ -7,7 +7,7 @@ import pytest
 
 import enerjax as ej
 from enerjax._solvers import solve_definite
-from enerjax._solvers.linear.dense import Inverse, inverse
+from enerjax._solvers.linear.dense import Inverse, inverse, inverse_by_cofactors
 
 from .helpers import EPS
 
@@ -43,6 +43,17 @@ def test_pivots_are_the_largest_entries(size, sign):
     exact = np.linalg.inv(matrix)
     bound = 10 * EPS * np.linalg.cond(matrix) * np.max(np.abs(exact))
     np.testing.assert_allclose(inverse(jnp.asarray(matrix)), exact, rtol=0, atol=bound)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 4])
+def test_cofactors_give_the_inverse_whatever_the_scales(size):
+    rng = np.random.default_rng(size)
+    matrix = rng.normal(size=(size, size)) + 2 * np.eye(size)
+    matrix *= 10.0 ** rng.integers(-9, 9, (size, 1)) * 10.0 ** rng.integers(-9, 9, size)
+    found = inverse_by_cofactors(jnp.asarray(matrix))
+    # Round-off, times the condition of a matrix of order one.
+    np.testing.assert_allclose(found, np.linalg.inv(matrix), rtol=2e-13)
+    assert not np.any(np.isfinite(inverse_by_cofactors(jnp.zeros((size, size)))))
 
 
 @pytest.mark.parametrize("size", [1, 2, 7, 20])
