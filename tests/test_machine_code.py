@@ -7,6 +7,7 @@ import time
 
 import jax
 import jax.numpy as jnp
+import llvmlite.binding
 import numpy as np
 import pytest
 from jax.ad_checkpoint import checkpoint_name
@@ -665,6 +666,23 @@ def test_lanes_of_many_numbers_spread_over_the_cache(lanes):
     assert len(numbers) == 32
     lines = [cellar.place_of(node, "f8") // 8 % 64 for node in numbers]
     assert max(lines.count(line) for line in lines) <= 2
+
+
+def test_code_ordered_quickly_gives_the_same_numbers(monkeypatch):
+    fn = jax.vmap(lambda x: jnp.cumsum(jnp.sin(x)[::-1] / (2 + x * x)) @ jnp.exp(-x))
+    other = lambda x: (fn(x), jnp.cos(x))
+    usual = jax.jit(in_one_function(fn))(X)
+    options, set_option = [], llvmlite.binding.set_option
+
+    def recorded(program, option):
+        options.append(option)
+        set_option(program, option)
+
+    monkeypatch.setattr(llvmlite.binding, "set_option", recorded)
+    monkeypatch.setattr(library, "_LONG_TEXT", 0)
+    np.testing.assert_array_equal(jax.jit(in_one_function(other))(X)[0], usual)
+    # They do not stay.
+    assert options == [*library._QUICK, *library._USUAL]
 
 
 def is_gather(x):

@@ -146,7 +146,7 @@ def _times(blocks: Array, x: Array) -> Array:
     return jnp.sum(blocks * x[:, None, :], axis=-1)
 
 
-# Pivoting takes four times as many operations as cofactors, and most of the program of a
-# body in quaternions. The map between rates and velocities needs none: cofactors lose
-# digits only where two or more directions are far shorter than the longest.
+# An inverse with pivots takes four times as many operations as one by cofactors, and would
+# be most of the program of a body in quaternions. Cofactors lose digits only where two or
+# more singular values are far smaller than the largest one, whatever the units.
 _inverses = jax.vmap(lambda x: (inverse if len(x) > 4 else inverse_by_cofactors)(x))
