@@ -652,7 +652,7 @@ def test_loops_do_not_gather_what_they_do_not_change():
 
 @pytest.mark.parametrize("lanes", [64, 512, 513])
 def test_lanes_of_many_numbers_spread_over_the_cache(lanes):
-    """32 lines at a time do not fit into the 8 places that a multiple of 4 kB has."""
+    """A cache keeps only 8 lines whose addresses differ by multiples of 4 kB."""
     program = jax.make_jaxpr(lambda x: jnp.cumsum(jnp.sin(x), axis=1))(
         jnp.ones((lanes, 32))
     )

@@ -49,7 +49,8 @@ _LEAST_FRACTION = 0.01
 class Powers(NamedTuple):
     """Thresholds that depend on the precision: powers of the machine epsilon.
 
-    - `of_unknowns`: a correction below this is round-off, like the residual of `round_off`.
+    - `of_unknowns`: a correction below this is round-off. It grows with the number of
+      unknowns, as `round_off` does.
     - `floor`: a correction of an unknown is measured relative to that unknown plus this
       fraction of the largest unknown.
     - `small`: a correction or a residual below this is in the range of convergence.
@@ -307,10 +308,10 @@ def _classify(
     converged = size * rate <= newton.rtol * powers.of_unknowns
     converged = ~fresh & shrinks & converged & (defect <= powers.small)
     is_root = (defect <= newton.atol * powers.eps) & small
-    # Larger corrections, such as those of stiff forces, are round-off if they decrease far
-    # less at once. A Jacobian that is not exact contracts at a constant rate. The motion of
-    # a light body can converge slowly after that of a heavy one, so the correction must be
-    # tiny too.
+    # Larger corrections, such as those of stiff forces, are round-off if they suddenly
+    # decrease far less than before. A Jacobian that is not exact contracts at a constant
+    # rate. The motion of a light body can converge slowly after that of a heavy one, so the
+    # correction must be tiny too.
     ends_at_once = iterate.accurate & (contraction > _AT_ONCE * iterate.contraction)
     ends_at_once = ends_at_once & (contraction > _SHRINKS_FAST) & (size <= powers.tiny)
     # Corrections with one Jacobian that have decreased and stop decreasing are round-off.

@@ -37,10 +37,10 @@ from .values import (
 # the registers are chosen, which takes a third longer, and its code is no faster.
 OPTIMISATION = 1
 
-# LLVM's time to order instructions and to find which of them share memory grows faster than
-# the length of a block. From this many characters on, another order is taken, that of the
-# fewest registers. It is found in a third of the time; in short programs the code would
-# take up to 5 % longer, and no less time to compile.
+# LLVM orders instructions and finds which of them use the same memory. The time that this
+# takes grows faster than the length of a block. Texts of this many characters and more get
+# another order, which needs few registers and is found in a third of the time. Short texts
+# would compile no faster with it, and their code would be up to 5 % slower.
 _LONG_TEXT = 2**20
 _QUICK = (
     "-pre-RA-sched=list-burr",
@@ -412,7 +412,7 @@ class _Compiled:
             reloc="pic",
             jit=True,
         )
-        with _orders_quickly(llvm, len(text)):
+        with _options_for(llvm, len(text)):
             code = target.emit_object(module)
         # Only the code stays in memory, and not the text that it was made of.
         engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), target)
@@ -444,11 +444,11 @@ def _library() -> _Library:
 
 
 @contextlib.contextmanager
-def _orders_quickly(llvm: Any, length: int) -> Iterator[None]:
-    """Options of LLVM for a long text.
+def _options_for(llvm: Any, length: int) -> Iterator[None]:
+    """Sets the options of LLVM for a text of this length.
 
-    They hold for the whole process, so they do not stay. A thread that compiles at the same
-    time gets right code of either order.
+    The options hold for the whole process, so they are set back afterwards. If another
+    thread compiles at the same time, its code is correct in either order.
     """
     if length < _LONG_TEXT or llvm.llvm_version_info[0] > _KNOWN_LLVM:
         yield

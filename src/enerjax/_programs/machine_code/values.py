@@ -117,19 +117,19 @@ class Block:
         self.region, self.ready, self.lanes = region, ready, lanes
 
 
-# A cache keeps a line of this many cells in one of a few places, which follow from the
-# lower bits of its address.
+# The cells of a line of the cache.
 _LINE = 8
-# Shorter lanes share the cache without this.
+# The number of lanes from which on they start at an odd distance; see `_distance`.
 _LONG = 64
 
 
 def _distance(count: int) -> int:
     """The distance to the next lanes, in cells: an odd number of lines.
 
-    The loop over the lanes of many numbers reads a line of each of them. At distances of a
-    power of two these lines would all belong to the same few places of the cache, and a
-    step of a beam of 512 elements takes one and a half times as long.
+    A loop over lanes reads one line of each of many numbers. The lower bits of the address
+    of a line determine the few places where the cache can keep it. If the distances were a
+    power of two, all these lines would compete for the same places: a step of a beam of 512
+    elements would take one and a half times as long.
     """
     return (-(-count // _LINE) | 1) * _LINE
 

@@ -76,9 +76,7 @@ def _cofactors_of_2(a: Array, b: Array) -> list[Array]:
 
 
 def _cofactors_of_3(a: Array, b: Array, c: Array) -> list[Array]:
-    after, before = np.array([1, 2, 0]), np.array([2, 0, 1])
-    cross = lambda x, y: x[after] * y[before] - x[before] * y[after]
-    return [cross(b, c), cross(c, a), cross(a, b)]
+    return [jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)]
 
 
 def _cofactors_of_4(a: Array, b: Array, c: Array, d: Array) -> list[Array]:

@@ -146,7 +146,10 @@ def _times(blocks: Array, x: Array) -> Array:
     return jnp.sum(blocks * x[:, None, :], axis=-1)
 
 
-# An inverse with pivots takes four times as many operations as one by cofactors, and would
-# be most of the program of a body in quaternions. Cofactors lose digits only where two or
-# more singular values are far smaller than the largest one, whatever the units.
-_inverses = jax.vmap(lambda x: (inverse if len(x) > 4 else inverse_by_cofactors)(x))
+@jax.vmap
+def _inverses(block: Float[Array, "k k"]) -> Float[Array, "k k"]:
+    # An inverse with pivots takes four times as many operations as one by cofactors, and
+    # would be most of the program of a body in quaternions. Cofactors lose digits only
+    # where two or more singular values are far smaller than the largest one, whatever the
+    # units.
+    return inverse_by_cofactors(block) if len(block) <= 4 else inverse(block)
