@@ -68,26 +68,29 @@ def scales_like(
 
 
 def roughness(
-    inertia: Increments, added: PyTree[Any], before: PyTree[Any], unit: PyTree[Any]
+    inertia: Increments,
+    differences: PyTree[Any],
+    before: PyTree[Any],
+    per_unknown: PyTree[Any],
 ) -> Float[Array, " 3"]:
     """The norms of the second and third differences of the velocities of the last steps.
 
-    They are computed from `added` and `before`: the differences between the unknowns and
-    their values without forces, for this step and for three or more steps before.
-    `inertia` is the scale `step` of `Scales`. Returns the norm of the second difference
-    and that of the third (square root of an energy), and the norm of the second difference
-    in the scales `unit` of the unknowns. They have zero derivatives.
+    `differences` are those of this step, of order zero to three and more, between the
+    unknowns and their values without forces; `before` are those of the step before.
+    `inertia` is the scale `step` of `Scales`, and `per_unknown` are the reciprocals of the
+    scales of the unknowns. Returns the norm of the second difference and that of the third
+    (square root of an energy), and the norm of the scaled second difference. They have zero
+    derivatives.
     """
     is_increment = lambda x: isinstance(x, Increment)
     leaves = lambda z: jax.tree.leaves(z, is_leaf=is_increment)
     ends = lambda z: list(filter(is_increment, leaves(z)))[-1].rate
-    rates = jnp.concatenate([ends(added)[None], ends(before)[:3]])
-    new, old = jnp.diff(rates, n=2, axis=0)
+    new, old = ends(differences), ends(before)
     size = lambda x: jnp.linalg.norm(x * inertia)
     # The larger of two successive differences, because one of them can pass through zero.
-    second = jnp.maximum(size(new), size(old))
-    part = jnp.linalg.norm(new / ends(unit))
-    return jax.lax.stop_gradient(jnp.stack([second, size(new - old), part]))
+    second = jnp.maximum(size(new[2]), size(old[2]))
+    part = jnp.linalg.norm(new[2] * ends(per_unknown))
+    return jax.lax.stop_gradient(jnp.stack([second, size(new[3]), part]))
 
 
 def local_error(sizes: Float[Array, "stages 3"], order: int) -> Scalar:

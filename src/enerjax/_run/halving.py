@@ -231,7 +231,7 @@ def _memory_of_parts(step: _Step, count: Scalar, chord_wait: Count | None) -> Me
     memory = step.memory
     return Memory(
         # What a step adds to a free flight is proportional to its length.
-        added=jax.tree.map(lambda x: x / count, memory.added),
+        differences=jax.tree.map(lambda x: x / count, memory.differences),
         choice=jnp.array(0),
         factors=memory.factors,
         chord_wait=chord_wait,
@@ -246,7 +246,7 @@ def _with_memory_after(step: _Step, done: Solved, count: Scalar) -> Solved:
         memory = _begun(step, _at_time(done.end.state, step.start, step.h), step.h)
     else:
         memory = Memory(
-            added=jax.tree.map(lambda x: count * x, last.added),
+            differences=jax.tree.map(lambda x: count * x, last.differences),
             choice=jnp.array(0),
             factors=last.factors,
             chord_wait=step.memory.chord_wait,

@@ -29,8 +29,8 @@ _CHORD_WAITS = 10
 class Memory(eqx.Module):
     """The data of the last steps that a solve uses.
 
-    - `added`: the unknowns of the last five steps minus those of a free flight, newest
-      first.
+    - `differences`: the unknowns of the last step minus those of a free flight, and of the
+      four steps before the backward differences of that, up to the fourth.
     - `choice`: the number of the candidate for the next prediction; see `predicted`.
     - `factors`: the factors of the Jacobians of the last three steps, newest first; `None`
       for large systems, and where the chord method is used.
@@ -40,11 +40,16 @@ class Memory(eqx.Module):
       other schemes.
     """
 
-    added: PyTree[Any]
+    differences: PyTree[Any]
     choice: Count
     factors: AbstractFactors | None
     chord_wait: Count | None
     carried: PyTree[Any]
+
+    @property
+    def added(self) -> PyTree[Any]:
+        """The unknowns of the last step minus those of a free flight."""
+        return jax.tree.map(lambda x: x[0], self.differences)
 
 
 def initial_memory(
@@ -54,11 +59,11 @@ def initial_memory(
     carried: PyTree[Any],
 ) -> Memory:
     """The memory before the first step, which is predicted to add `added`."""
-    repeated = lambda tree, count: jax.tree.map(lambda x: jnp.stack([x] * count), tree)
+    steady = lambda x: jnp.stack([x] + [jnp.zeros_like(x)] * (_NUM_KEPT - 1))
     return Memory(
-        added=jax.lax.stop_gradient(repeated(added, _NUM_KEPT)),
+        differences=jax.lax.stop_gradient(jax.tree.map(steady, added)),
         choice=jnp.array(0),
-        factors=repeated(factors, 3),
+        factors=jax.tree.map(lambda x: jnp.stack([x] * 3), factors),
         chord_wait=chord_wait,
         carried=carried,
     )
@@ -72,36 +77,49 @@ def predicted(memory: Memory) -> PyTree[Any]:
     of degree four from five. The last step decides: the candidate is chosen that would have
     been best for it, that of degree four only if it would have been ten times better.
     """
-    candidates = _candidates(memory)
 
-    def chosen(*xs: Array) -> Array:
-        x = xs[0]
-        for k, other in enumerate(xs[1:], 1):
-            x = jnp.where(memory.choice == k, other, x)
-        return x
+    def chosen(differences: Array) -> Array:
+        total = best = differences[0]
+        for k in range(1, len(_CANDIDATES)):
+            # An extrapolated value is the sum of the differences.
+            for difference in differences[_CANDIDATES[k - 1] : _CANDIDATES[k]]:
+                total = total + difference
+            best = jnp.where(memory.choice == k, total, best)
+        return best
 
-    return jax.tree.map(chosen, *candidates)
+    return jax.tree.map(chosen, memory.differences)
 
 
-def _candidates(memory: Memory) -> tuple[PyTree[Any], ...]:
-    of = lambda count: lambda x: extrapolated(x[:count])
-    return tuple(jax.tree.map(of(count), memory.added) for count in _CANDIDATES)
+def differences_after(added: PyTree[Any], before: PyTree[Any]) -> PyTree[Any]:
+    """The differences after a step that adds `added`; one more order than `before`."""
+
+    def after(x: Array, old: Array) -> Array:
+        new = [x]
+        for difference in old:
+            new.append(new[-1] - difference)
+        return jnp.stack(new)
+
+    return jax.tree.map(after, added, before)
 
 
 def memory_after(
     memory: Memory,
-    added: PyTree[Any],
-    unknown_scale: PyTree[Any],
+    differences: PyTree[Any],
+    per_unknown: PyTree[Any],
     root: Root,
     carried: PyTree[Any],
 ) -> Memory:
-    """The memory after a step whose difference from a free flight is `added`."""
+    """The memory after a step with the result `differences` of `differences_after`.
 
-    def error(guess: PyTree[Any]) -> Scalar:
-        difference = lambda x, y, unit: (x - y) / unit
-        return max_norm(jax.tree.map(difference, added, guess, unknown_scale))
+    `per_unknown` are the reciprocals of the scales of the unknowns.
+    """
 
-    errors = [error(guess) for guess in _candidates(memory)]
+    def error(count: int) -> Scalar:
+        # What an extrapolation from some steps misses is the next difference.
+        scaled = lambda x, per_unit: x[count] * per_unit
+        return max_norm(jax.tree.map(scaled, differences, per_unknown))
+
+    errors = [error(count) for count in _CANDIDATES]
     least, choice = errors[0], jnp.zeros_like(memory.choice)
     for k, each in enumerate(errors[1:], 1):
         is_best = _BETTER[k] * each <= least
@@ -112,7 +130,7 @@ def memory_after(
     if root.factors is not None:
         factors = jax.tree.map(_shifted, root.factors, memory.factors)
     return Memory(
-        added=jax.tree.map(_shifted, added, memory.added),
+        differences=jax.tree.map(lambda x: x[:_NUM_KEPT], differences),
         choice=choice,
         factors=factors,
         chord_wait=_wait_after(memory.chord_wait, root),
@@ -149,7 +167,7 @@ def for_length(
 
     What a step adds to a free flight is proportional to its length, so their quotient is
     extrapolated quadratically from the midpoints of the three steps. `solve` extrapolates
-    steps of equal lengths: the entries are chosen such that it finds this value, or the
+    steps of equal lengths: the differences are chosen such that it finds this value, or the
     last one.
     """
     ends = np.cumsum(stages)
@@ -167,19 +185,22 @@ def for_length(
 
     def resampled(x: Array) -> Array:
         shaped = lambda w: w.reshape(-1, *[1] * (x.ndim - 2))
-        rates = x[:, 0] / a, x[:, 1] / b, x[:, 2] / c
+        newest, first, second = x[:, 0], x[:, 1], x[:, 2]
+        steps = newest, newest - first, newest - 2 * first + second
+        rates = [step / each for step, each in zip(steps, before, strict=True)]
         smooth = sum(shaped(w) * rate for w, rate in zip(weights, rates, strict=True))
-        # A parabola through the last value and, after it, the extrapolated one.
         last, rise = length * rates[0], length * (smooth - rates[0])
-        values = [last + 0.5 * k * (k - 1) * rise for k in range(_NUM_KEPT)]
-        return jnp.stack(values, axis=1)
+        # The second difference of a parabola is what its extrapolation adds.
+        zero = jnp.zeros_like(last)
+        return jnp.stack([last, zero, rise, zero, zero], axis=1)
 
-    added = jax.tree.map(resampled, memory.added)
-    return eqx.tree_at(lambda memory: memory.added, memory, added)
+    differences = jax.tree.map(resampled, memory.differences)
+    return eqx.tree_at(lambda memory: memory.differences, memory, differences)
 
 
 def with_history(new: Memory, old: Memory) -> Memory:
     """The last step of the stacked memory `new`, and before it the steps of `old`."""
-    join = lambda x, y: jnp.concatenate([x[:, :1], y[:, :-1]], axis=1)
-    added = jax.tree.map(join, new.added, old.added)
-    return eqx.tree_at(lambda memory: memory.added, new, added)
+    newest = jax.tree.map(lambda x: x[:, 0], new.differences)
+    after = jax.vmap(differences_after)(newest, old.differences)
+    differences = jax.tree.map(lambda x: x[:, :_NUM_KEPT], after)
+    return eqx.tree_at(lambda memory: memory.differences, new, differences)

@@ -36,7 +36,14 @@ from ..schemes import (
     AbstractSchemeWithMemory,
     StepEnd,
 )
-from .prediction import extrapolated, initial_memory, Memory, memory_after, predicted
+from .prediction import (
+    differences_after,
+    extrapolated,
+    initial_memory,
+    Memory,
+    memory_after,
+    predicted,
+)
 
 
 # Enough for the linear convergence of a step that locks. A step that needs more has failed.
@@ -171,8 +178,7 @@ def unsolved(
 ) -> Solved:
     """A step of which no part is solved: it ends where it starts."""
     problem = step_problem(scheme, model, start, h, memory.carried)
-    z = jax.tree.map(lambda x: x[0], memory.added)
-    like = jax.eval_shape(lambda: scheme.finish(z, problem))
+    like = jax.eval_shape(lambda: scheme.finish(memory.added, problem))
     end = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
     return Solved(
         end=eqx.tree_at(lambda end: end.state, end, start),
@@ -243,8 +249,7 @@ def _solved(
     root_finder: RootFinder | ChordAlone,
 ) -> Solved:
     """The result of a step whose search has ended with `root`."""
-    unknown_scale = prepared.scales.unknown
-    z = jax.tree.map(jnp.multiply, root.value, unknown_scale)
+    z = jax.tree.map(jnp.multiply, root.value, prepared.scales.unknown)
     end = scheme.finish(z, problem)
     tests = lambda: _gradients_reverse(model, start, end.state)
     no = jnp.array(False)
@@ -258,14 +263,15 @@ def _solved(
     branch = RESULTS.where(reverses, RESULTS.step_too_large, RESULTS.successful)
     found = from_root_finder(root.found, root.broken, root.finite)
     added = jax.lax.stop_gradient(jax.tree.map(jnp.subtract, z, prepared.flight))
-    sizes = model.scales.step, added, memory.added, unknown_scale
+    differences, before = differences_after(added, memory.differences), memory.differences
+    per_unknown = prepared.scales.per_unknown
     return Solved(
         end=end,
         iterations=root.iterations,
         residual=root.residual,
         result=first_failure(first_failure(end.result, found), branch),
-        roughness=roughness(*sizes),
-        memory=memory_after(memory, added, unknown_scale, root, end.carried),
+        roughness=roughness(model.scales.step, differences, before, per_unknown),
+        memory=memory_after(memory, differences, per_unknown, root, end.carried),
     )
 
 
@@ -297,7 +303,7 @@ def _chord(scheme: AbstractOneSolveScheme) -> Chord:
 
 def num_unknowns(memory: Memory) -> int:
     """The number of unknowns of a solve."""
-    return sum(x[0].size for x in jax.tree.leaves(memory.added))
+    return sum(x[0].size for x in jax.tree.leaves(memory.differences))
 
 
 def _gradients_reverse(model: AbstractModel, a: State, b: State) -> Flag:

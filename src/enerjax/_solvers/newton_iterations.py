@@ -342,9 +342,11 @@ def _next_iterate(
     taken = fresh | correction.shrinks | verdict.is_root
     # The second correction with a Jacobian estimates the error after the first one. If it
     # has not decreased enough and is larger than round-off, the first one is halved
-    # (P. Deuflhard's natural monotonicity test).
+    # (P. Deuflhard's natural monotonicity test). Unknowns that pass through zero have large
+    # relative corrections, so it also suffices if the first one has halved the residual.
     is_second = ~fresh & (iterate.contraction == 0) & (iterate.size > powers.small)
     is_monotone = correction.contraction <= 1 - 0.25 * fraction
+    is_monotone = is_monotone | (correction.defect <= 0.5 * iterate.defect)
     halves = (
         damped & is_second & ~is_monotone & ~verdict.done & (fraction > _LEAST_FRACTION)
     )
@@ -362,7 +364,7 @@ def _next_iterate(
         corrections=iterate.corrections + changes,
         jacobians=iterate.jacobians,
         stalls=verdict.stalls,
-        defect=correction.defect,
+        defect=jnp.where(halves, iterate.defect, correction.defect),
         fresh=jnp.zeros_like(fresh),
         stale=~taken & ~halves,
         done=verdict.done,

@@ -3,7 +3,10 @@
 from collections.abc import Callable
 from typing import TypeAlias
 
+import numpy as np
+
 from .graph import as_number, FUNCTIONS, Graph, Number
+from .values import Unsupported
 
 
 # Called with the graph, the parameters of the equation, the type of the result, those of
@@ -56,6 +59,12 @@ def _clamp(graph, params, dtype, of, low, x, high):
 
 def _convert(graph, params, dtype, of, x):
     return graph.op("convert", dtype, (x,), of[0])
+
+
+def _bits(graph, params, dtype, of, x):
+    if np.dtype(dtype).itemsize != np.dtype(of[0]).itemsize:
+        raise Unsupported("a cast of bits to a type of another size")
+    return graph.op("bits", dtype, (x,), of[0])
 
 
 def _integer_pow(graph, params, dtype, of, x):
@@ -141,6 +150,7 @@ ELEMENTWISE: dict[str, Rule] = {
     **{name: _logical(name) for name in "and not or xor".split()},
     "abs": _abs,
     "add_any": _plain("add"),
+    "bitcast_convert_type": _bits,
     "clamp": _clamp,
     "convert_element_type": _convert,
     "integer_pow": _integer_pow,

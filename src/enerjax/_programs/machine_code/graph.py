@@ -306,6 +306,9 @@ def _folded(op: str, dtype: str, operands: tuple[Any, ...], extra: Any) -> Numbe
         if op == "convert":
             (x,) = operands
             return _converted(x, dtype)
+        if op == "bits":
+            (x,) = operands
+            return as_number(np.array(x, extra).view(dtype), dtype)
         if op == "not":
             (x,) = operands
             return (not x) if dtype == "b1" else as_number(~x, dtype)

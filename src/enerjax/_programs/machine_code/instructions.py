@@ -232,6 +232,9 @@ class Instructions:
         how = "trunc" if new < old else "sext" if of[0] == "i" else "zext"
         return self._say(f"{how} {from_type} {x} to {t}")
 
+    def _bits(self, dtype, node, x):
+        return self._say(f"bitcast {self._t(node.extra)} {x} to {self._t(dtype)}")
+
     def _saturated(self, dtype, of, x):
         t, from_type = self._t(dtype), self._t(of)
         suffix = f"v{self.vector}" if self.vector > 1 else ""

@@ -27,11 +27,13 @@ class Places(Indices):
       positions, where a block is smaller than the largest one. `read`: the same with the
       first row of the block at padded positions, whose values are not used.
     - `padding`: ones on the diagonal at padded positions.
+    - `coupled`: whether an entry of the blocks can be nonzero, shape `(size, size)`. Rows
+      of a block are coupled if they have the same number in `parts`.
     - `back`: the position of each row in the blocks, and `within`: in its own block.
     """
 
-    def __init__(self, labels: np.ndarray):
-        super().__init__(labels)
+    def __init__(self, labels: np.ndarray, parts: np.ndarray):
+        super().__init__(np.stack([labels, parts]))
         size, sizes = labels.size, np.bincount(labels)
         order = np.argsort(labels, kind="stable")
         starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
@@ -40,10 +42,13 @@ class Places(Indices):
         self.rows[labels[order], within] = order
         self.read = np.where(self.rows == size, self.rows[:, :1], self.rows)
         self.padding = (self.rows == size)[:, :, None] * np.eye(sizes.max())
+        own = np.append(parts, -1)[self.rows]
+        self.coupled = np.any(own[:, :, None] == own[:, None, :], axis=0)
         self.back = np.zeros(size, int)
         self.back[order] = labels[order] * sizes.max() + within
         self.within = np.zeros(size, int)
         self.within[order] = within
+        self.parts = parts
 
 
 class BlockDiagonal(eqx.Module):
@@ -66,10 +71,18 @@ class BlockDiagonal(eqx.Module):
 
     def __matmul__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         by_block = at_places(x, self.places.read)[:, None, :]
-        return at_places(jnp.sum(self.blocks * by_block, axis=-1).ravel(), self.places.back)
+        products = self.known_zeros(self.blocks) * by_block
+        return at_places(jnp.sum(products, axis=-1).ravel(), self.places.back)
 
     def __rmatmul__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         return self @ x  # symmetric
+
+    def known_zeros(self, blocks: Float[Array, "*many size size"]) -> Array:
+        """Blocks of this matrix whose zeros are known when a program is made.
+
+        Products with known zeros cost nothing.
+        """
+        return jnp.where(self.places.coupled, blocks, 0)
 
     def diagonal(self) -> Float[Array, " n"]:
         diagonals = jnp.diagonal(self.blocks, axis1=1, axis2=2)
@@ -103,7 +116,11 @@ def padded(matrix: Symmetric, count: int) -> Symmetric:
     rows, size = matrix.places.rows, matrix.shape[0]
     labels = np.zeros(size + 1, int)
     labels[rows.ravel()] = np.repeat(np.arange(len(rows)), rows.shape[1])
-    places = Places(np.append(labels[:size], len(rows) + np.arange(count)))
+    new = size + np.arange(count)
+    places = Places(
+        np.append(labels[:size], len(rows) + np.arange(count)),
+        np.append(matrix.places.parts, new),
+    )
     zeros = jnp.asarray(places.padding[len(rows) :], matrix.dtype)
     return BlockDiagonal(places, jnp.concatenate([matrix.blocks, zeros]))
 
@@ -155,11 +172,7 @@ def hessian(
     """
     gradient = jax.grad(fn)
     pattern = jacobian_pattern(gradient, at) if at.size > _FEW else None
-    if pattern is not None and together is not None:
-        pattern = scipy.sparse.csr_array(
-            pattern.toarray() | (together[:, None] == together[None])
-        )
-    places = None if pattern is None else _places(pattern)
+    places = None if pattern is None else _places(pattern, together)
     if places is None:
         return jax.jacfwd(gradient)(at)
     # One product for each column of the blocks, for all blocks at once.
@@ -183,6 +196,17 @@ def in_blocks(matrix: Float[Array, "n n"]) -> Symmetric:
     return BlockDiagonal(places, blocks + jnp.asarray(places.padding, matrix.dtype))
 
 
-def _places(pattern: "scipy.sparse.csr_array") -> Places | None:
-    _, labels = scipy.sparse.csgraph.connected_components(pattern, directed=False)
-    return Places(labels) if np.bincount(labels).max() <= _LARGEST_BLOCK else None
+def _places(
+    pattern: "scipy.sparse.csr_array", together: np.ndarray | None = None
+) -> Places | None:
+    parts = _components(pattern)
+    labels = parts
+    if together is not None:
+        joined = pattern.toarray() | (together[:, None] == together[None])
+        labels = _components(scipy.sparse.csr_array(joined))
+    is_small = np.bincount(labels).max() <= _LARGEST_BLOCK
+    return Places(labels, parts) if is_small else None
+
+
+def _components(pattern: "scipy.sparse.csr_array") -> np.ndarray:
+    return scipy.sparse.csgraph.connected_components(pattern, directed=False)[1]
