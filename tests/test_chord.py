@@ -4,6 +4,7 @@ import functools
 import sys
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
@@ -14,7 +15,14 @@ from jax.flatten_util import ravel_pytree
 import enerjax as ej
 from enerjax._operators import DelassusMatrix, make_model
 from enerjax._run import experience
-from enerjax._run.prediction import extrapolated
+from enerjax._run.prediction import (
+    differences_after,
+    extrapolated,
+    for_length,
+    initial_memory,
+    predicted,
+    with_history,
+)
 from enerjax._solvers import Chord, find_root, Newton, schur, schur_tables
 from enerjax._solvers.linear.block_diagonal import in_blocks
 from enerjax._solvers.linear.krylov import jacobian_solver
@@ -34,6 +42,49 @@ def test_a_quadratic_motion_is_predicted_exactly():
     expected = [quadratic(3), quadratic(3.5)]
     # Round-off of sums whose terms are at most 100.
     np.testing.assert_allclose(extrapolated(values), expected, rtol=0, atol=1e3 * EPS)
+
+
+def _memory_after(values):
+    """The memory after steps that add these values, oldest first."""
+    memory = initial_memory(values[0], None, None, None)
+    for value in values[1:]:
+        differences = differences_after(value, memory.differences)[:5]
+        memory = eqx.tree_at(lambda memory: memory.differences, memory, differences)
+    return memory
+
+
+VALUES = jnp.asarray(np.random.default_rng(0).normal(size=(7, 4)))
+
+
+@pytest.mark.parametrize(("choice", "count"), [(0, 1), (1, 3), (2, 5)])
+def test_a_prediction_is_that_of_the_polynomial_through_the_last_steps(choice, count):
+    memory = _memory_after(VALUES)
+    memory = eqx.tree_at(lambda memory: memory.choice, memory, jnp.array(choice))
+    expected = extrapolated(VALUES[::-1][:count])
+    # Round-off of sums whose terms are at most 30.
+    np.testing.assert_allclose(predicted(memory), expected, rtol=0, atol=100 * EPS)
+
+
+def test_the_last_difference_is_the_error_of_the_prediction_from_five_steps():
+    differences = differences_after(VALUES[-1], _memory_after(VALUES[:-1]).differences)
+    error = VALUES[-1] - extrapolated(VALUES[::-1][1:6])
+    np.testing.assert_allclose(differences[5], error, rtol=0, atol=100 * EPS)
+
+
+def test_a_memory_for_another_length_has_the_history_of_the_steps_before():
+    """For steps of equal lengths the prediction is the quadratic one. After a step the
+    history is that of the steps, not that of the prediction."""
+    old = jax.tree.map(lambda x: x[None], _memory_after(VALUES[:-1]))
+    old = eqx.tree_at(lambda memory: memory.choice, old, jnp.array([1]))
+    resampled = for_length(old, (1.0,), 0.1 * jnp.ones(3), jnp.array(0.1))
+    of_one = jax.tree.map(lambda x: x[0], resampled)
+    expected = extrapolated(VALUES[::-1][1:4])
+    np.testing.assert_allclose(predicted(of_one), expected, rtol=0, atol=100 * EPS)
+    differences = differences_after(VALUES[-1], of_one.differences)[None, :5]
+    new = eqx.tree_at(lambda memory: memory.differences, resampled, differences)
+    found = with_history(new, old).differences[0]
+    expected = _memory_after(VALUES).differences
+    np.testing.assert_allclose(found, expected, rtol=0, atol=100 * EPS)
 
 
 # The matrix of the multipliers ------------------------------------------------------------

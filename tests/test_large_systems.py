@@ -171,6 +171,30 @@ def test_padded_blocks_couple_no_others():
     assert pattern.nnz == 30 * 9 + 7
 
 
+def test_zeros_within_the_blocks_of_bodies_are_known():
+    """A body has one block, in which its translations are coupled with nothing else."""
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(4, 3, 3))
+    polar = jnp.asarray(root @ root.swapaxes(1, 2))
+
+    def energy(v):
+        moved, turned = v.reshape(4, 2, 3).swapaxes(0, 1)
+        spin = jnp.einsum("ki,kij,kj", turned, polar, turned)
+        return jnp.sum(moved**2) + 0.5 * spin
+
+    bodies = np.repeat(np.arange(4), 6)
+    inertia, full = hessian(energy, jnp.zeros(24), bodies), jax.hessian(energy)
+    assert isinstance(inertia, BlockDiagonal)
+    assert inertia.blocks.shape == (4, 6, 6)
+    coupled = np.eye(6, dtype=bool)
+    coupled[3:, 3:] = True
+    np.testing.assert_array_equal(inertia.places.coupled, coupled)
+    x = jnp.asarray(rng.normal(size=24))
+    expected = full(jnp.zeros(24)) @ x
+    np.testing.assert_allclose(inertia @ x, expected, rtol=0, atol=100 * EPS)
+    np.testing.assert_allclose(inverse_of(inertia) @ expected, x, rtol=0, atol=1e5 * EPS)
+
+
 NUM_LINKS = 20
 
 

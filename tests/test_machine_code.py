@@ -43,6 +43,7 @@ def elementwise(x, k):
         *(f(x, 1 - x) for f in (lax.ge, lax.pow, lax.sub, lax.mul, lax.add)),
         x**3,
         lax.clamp(0.2, x, 0.6),
+        lax.bitcast_convert_type(lax.bitcast_convert_type(x, jnp.int64) + k, float),
         *(f(k, k + 1) for f in (lax.bitwise_and, lax.bitwise_or, lax.bitwise_xor)),
         lax.bitwise_not(k),
         *(f(bits, bits) for f in (lax.shift_left, lax.shift_right_logical)),
@@ -506,12 +507,22 @@ def whole_numbers(k):
     ]
 
 
+def bits_of_known_numbers(k):
+    x = np.array([-0.0, np.nan, -np.inf, 5e-324, 1.5])
+    return [
+        jax.lax.bitcast_convert_type(jnp.asarray(x, t), whole) + jnp.max(k).astype(whole)
+        for t, whole in ((jnp.float64, jnp.int64), (jnp.float32, jnp.int32))
+    ]
+
+
 def conversions(k):
     x = jnp.concatenate([k.astype(float), jnp.array([1e30, -1e30, jnp.nan, -3.7])])
     return [x.astype(t) for t in (jnp.int32, jnp.int64, jnp.uint32, bool, jnp.float32)]
 
 
-@pytest.mark.parametrize("fn", [whole_numbers, conversions], ids=lambda fn: fn.__name__)
+@pytest.mark.parametrize(
+    "fn", [whole_numbers, bits_of_known_numbers, conversions], ids=lambda fn: fn.__name__
+)
 def test_numbers_at_the_ends_of_their_range(fn):
     k = jnp.array([7, -5, 3], jnp.int32)
     assert is_compiled(in_one_function(fn), k)
