@@ -145,12 +145,22 @@ def _points_at(masses: np.ndarray, length: float, end: float) -> np.ndarray:
 
 
 def _points(
-    name: str, count: int, steps: int, bars: Bars, scheme: str = PRESERVING
+    name: str,
+    count: int,
+    steps: int,
+    bars: Bars,
+    scheme: str = PRESERVING,
+    size: float = 1.0,
 ) -> Work:
-    masses, length, h = np.full(count, 1 / count), 1 / count, 1e-3
+    """A chain with this length (m) and mass (kg).
+
+    A chain of 1 m oscillates faster the more points it has, and from 64 on a step of 1 ms
+    does not resolve that. One whose rods are 1 m long oscillates slowly.
+    """
+    masses, length, h = np.full(count, size / count), size / count, 1e-3
     motion = Motion(
         name=name,
-        problem=lambda: ej.problems.chain(count),
+        problem=lambda: ej.problems.chain(count, length=size, mass=size),
         h=h,
         reference=lambda: _points_at(masses, length, steps * h),
         exudyn=lambda exudyn: exudyn.points(masses, length, 0.5),
@@ -312,6 +322,10 @@ def _works() -> list[Work]:
         _points("points-64", 64, 500, chained),
         _points("points-512", 512, 200, chained),
         _points("points-2000", 2000, 100, chained),
+        *(
+            _points(f"points-{count}-long", count, steps, chained, size=float(count))
+            for count, steps in ((8, 1000), (64, 500), (512, 200))
+        ),
         _linkage(
             "slider-crank", ej.problems.slider_crank, planar.slider_crank, 2000, "exudyn"
         ),
