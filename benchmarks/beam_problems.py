@@ -2,12 +2,18 @@
 
     python benchmarks/beam_problems.py [--only NAME] [--out FOLDER]
 
+- Statics and modes (`beam_statics.py`): an end moment that closes a circle, the elastica,
+  K. Nachbagauer's thick cantilever, a beam with coupled stiffnesses, the Princeton
+  experiment, S. P. Timoshenko's linear solution, objectivity, and frequencies.
 - `arc`: K.-J. Bathe and S. Bolourchi (1979), statics; the reference is a shooting method.
 - `spin-up`: J. C. Simo and L. Vu-Quoc (1986); the steady extension in closed form.
 - `spaghetti`: J. C. Simo and L. Vu-Quoc (1986); the angular momentum after the loads.
 - `right angle`: J. C. Simo and L. Vu-Quoc (1988); digitised from the paper, to 0.5 %.
 - `double pendulum`: M. Geradin and A. Cardona (2001), nearly rigid; the rigid mechanism by
   an explicit Runge-Kutta method of order 8 in two angles.
+- `four-bar`: P. L. Kinon, P. Betsch and S. R. Eugster (2025); the rigid mechanism.
+- `stiff`: a pendulum with EA = 1e6 EI / L^2, and steps far above the periods of its
+  stretch; the reference is a run of order 4 with steps that resolve them.
 - `long run`: a free beam, the largest changes of energy and momenta in 1e5 steps, with its
   mass centre at rest and far from the origin.
 
@@ -16,7 +22,6 @@ Writes beam_problems.csv.
 
 import argparse
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import harness
@@ -24,17 +29,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
+from beam_statics import Row, STATICS
 
 import enerjax as ej
-
-
-@dataclass(frozen=True)
-class Row:
-    problem: str
-    setting: str
-    quantity: str
-    value: float
-    reference: float | None
 
 
 def arc() -> Iterator[Row]:
@@ -207,6 +204,76 @@ def _rigid_double_pendulum(t: float) -> np.ndarray:
     return np.array([np.cos(a) + np.cos(b), np.sin(a) + np.sin(b)])
 
 
+def four_bar() -> Iterator[Row]:
+    """The middle of the coupler after 1 s, of bars that are bent by about a millimetre."""
+    pins = np.array([[0.0, 0.0], [2.0, 1.0], [3.5, 1.0], [2.5, 0.0]])
+    section = ej.Section.rectangle(
+        0.05, 0.05, E=2.1e11, nu=0.3, rho=2710.0, shear_factor=1.0
+    )
+    names = (("crank", 10), ("coupler", 6), ("rocker", 6))
+    bars = crank, coupler, rocker = [
+        ej.bodies.Beam(name, pins[k : k + 2], section, elements)
+        for k, (name, elements) in enumerate(names)
+    ]
+    scene = ej.Scene(
+        [
+            *bars,
+            ej.joints.Revolute("A", "ground", crank.start),
+            ej.joints.Revolute("B", crank.end, coupler.start),
+            ej.joints.Revolute("C", coupler.end, rocker.start),
+            ej.joints.Revolute("D", "ground", rocker.end, pins[3]),
+        ],
+        gravity=[0.0, -9.81],
+    )
+    system, start, args = scene.build()
+    schemes = {
+        "EnergyPreserving()": ej.EnergyPreserving(),
+        "EnergyMomentumDecaying(0.5)": ej.EnergyMomentumDecaying(0.5),
+    }
+    for setting, scheme in schemes.items():
+        sol = ej.simulate(system, scheme, start, args, h=1e-3, num_steps=1000)
+        place = scene.position(sol.ys, coupler.node(3))[-1]
+        for name, value, rigid in zip("xy", place, (1.39556674, -0.76494746), strict=True):
+            yield Row("four-bar", setting, name, float(value), rigid)
+        largest = float(jnp.abs(sol.audit.leak).max() / sol.audit.kinetic.max())
+        yield Row("four-bar", setting, "energy that nothing explains", largest, 0.0)
+
+
+def stiff() -> Iterator[Row]:
+    section = ej.Section(EA=1e6, GA=1e6, EI=1.0, rhoA=1.0, rhoI=1e-3)
+    beam = ej.bodies.Beam("beam", [[0.0, 0.0], [1.0, 0.0]], section, 4)
+    pin = ej.joints.Revolute("pin", "ground", beam.start)
+    system, start, args = (scene := ej.Scene([beam, pin], gravity=[0.0, -9.81])).build()
+
+    def run(scheme, h):
+        steps = round(1 / h)
+        sol = ej.simulate(system, scheme, start, args, h=h, num_steps=steps, throw=False)
+        return sol, np.asarray(scene.position(sol.ys, beam.end)[-1])
+
+    _, exact = run(ej.Composed(ej.EnergyPreserving(), 4), 2e-4)
+    schemes = {
+        "EnergyPreserving()": ej.EnergyPreserving(),
+        "EnergyConsistent(0.0)": ej.EnergyConsistent(0.0),
+        "EnergyConsistent(1.0)": ej.EnergyConsistent(1.0),
+        "EnergyDecaying(1.0)": ej.EnergyDecaying(1.0),
+        "EnergyMomentumDecaying(1.0)": ej.EnergyMomentumDecaying(1.0),
+    }
+    for h in (0.02, 0.0025):
+        for name, scheme in schemes.items():
+            (sol, tip), setting = run(scheme, h), f"{name}, h = {h}"
+            completed = int(sol.stats.completed_steps)
+            yield Row("stiff", setting, "steps that have not failed", completed, 1 / h)
+            energy, kinetic = (
+                np.asarray(x)[: completed + 1]
+                for x in (sol.audit.energy, sol.audit.kinetic)
+            )
+            gain = float(np.diff(energy).max() / kinetic.max())
+            yield Row("stiff", setting, "largest gain of energy in a step", gain, 0.0)
+            if completed == round(1 / h):
+                error = float(np.abs(tip - exact).max())
+                yield Row("stiff", setting, "error of the tip", error, 0.0)
+
+
 def long_run() -> Iterator[Row]:
     section = ej.Section(EA=1e4, GA=1e4, EI=[100.0, 50.0], GJ=40.0, rhoA=1.0, rhoI=0.1)
     beam = ej.bodies.Beam(
@@ -242,11 +309,14 @@ def _momenta_in_space(system, args, q, v) -> tuple[jax.Array, jax.Array]:
 
 
 PROBLEMS: dict[str, Callable[[], Iterator[Row]]] = {
+    **STATICS,
     "arc": arc,
     "spin-up": spin_up,
     "spaghetti": spaghetti,
     "right angle": right_angle,
     "double pendulum": double_pendulum,
+    "four-bar": four_bar,
+    "stiff": stiff,
     "long run": long_run,
 }
 

@@ -52,7 +52,7 @@ def test_a_correction_that_halves_the_residual_is_taken_whole():
     With halved corrections this takes 19 of them."""
     fn = lambda x, _: jnp.stack([1e-3 * x[0] + 1e-2 * (x[1] - 1) ** 2, x[1] ** 2 - 1])
     guess = jnp.asarray([1.0, 3.0])
-    found = find_root(fn, Newton(), guess, None, max_iterations=50)
+    found = find_root(fn, Newton(), guess, None, max_iterations=50, others=(guess,))
     assert found.found
     np.testing.assert_allclose(found.value, [0, 1], rtol=0, atol=10 * EPS)
     assert found.iterations <= 12
@@ -84,6 +84,17 @@ def test_the_largest_entry_is_infinite_beside_nan(entry, size, dtype):
         found = fn(x)
         assert found.dtype == dtype
         assert found == expected
+
+
+@pytest.mark.parametrize(
+    "fn", [lambda x: x**2, lambda x: jnp.maximum(x, 0), jnp.exp, jnp.abs],
+    ids=["square", "maximum", "exp", "abs"],
+)  # fmt: skip
+def test_a_nan_with_a_sign_is_found_among_numbers_without(fn):
+    """The processor's `inf - inf` is a negative NaN, and XLA knows that squares are not
+    negative."""
+    x = jnp.array([1.0, jnp.inf])
+    assert jax.jit(lambda x: largest(fn(x - x)))(x) == jnp.inf
 
 
 def test_nothing_has_the_largest_entry_zero():

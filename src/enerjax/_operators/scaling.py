@@ -75,8 +75,7 @@ def roughness(
 ) -> Float[Array, " 3"]:
     """The norms of the second and third differences of the velocities of the last steps.
 
-    `differences` are those of this step, of order zero to three and more, between the
-    unknowns and their values without forces; `before` are those of the step before.
+    `differences` and `before` are those of `Memory` after this step and before it.
     `inertia` is the scale `step` of `Scales`, and `per_unknown` are the reciprocals of the
     scales of the unknowns. Returns the norm of the second difference and that of the third
     (square root of an energy), and the norm of the scaled second difference. They have zero

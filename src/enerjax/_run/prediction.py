@@ -29,8 +29,8 @@ _CHORD_WAITS = 10
 class Memory(eqx.Module):
     """The data of the last steps that a solve uses.
 
-    - `differences`: the unknowns of the last step minus those of a free flight, and of the
-      four steps before the backward differences of that, up to the fourth.
+    - `differences`: what the last step has added to the unknowns of a free flight, and the
+      backward differences of this over the last five steps, of the orders one to four.
     - `choice`: the number of the candidate for the next prediction; see `predicted`.
     - `factors`: the factors of the Jacobians of the last three steps, newest first; `None`
       for large systems, and where the chord method is used.
@@ -48,7 +48,7 @@ class Memory(eqx.Module):
 
     @property
     def added(self) -> PyTree[Any]:
-        """The unknowns of the last step minus those of a free flight."""
+        """What the last step has added to the unknowns of a free flight."""
         return jax.tree.map(lambda x: x[0], self.differences)
 
 
@@ -91,7 +91,10 @@ def predicted(memory: Memory) -> PyTree[Any]:
 
 
 def differences_after(added: PyTree[Any], before: PyTree[Any]) -> PyTree[Any]:
-    """The differences after a step that adds `added`; one more order than `before`."""
+    """The differences after a step that adds `added`.
+
+    They go one order higher than those `before` it.
+    """
 
     def after(x: Array, old: Array) -> Array:
         new = [x]
@@ -109,14 +112,14 @@ def memory_after(
     root: Root,
     carried: PyTree[Any],
 ) -> Memory:
-    """The memory after a step with the result `differences` of `differences_after`.
+    """The memory after a step; `differences` are the result of `differences_after`.
 
     `per_unknown` are the reciprocals of the scales of the unknowns.
     """
 
     def error(count: int) -> Scalar:
-        # What an extrapolation from some steps misses is the next difference.
-        scaled = lambda x, per_unit: x[count] * per_unit
+        # The error of an extrapolation from `count` steps is the difference of this order.
+        scaled = lambda x, factor: x[count] * factor
         return max_norm(jax.tree.map(scaled, differences, per_unknown))
 
     errors = [error(count) for count in _CANDIDATES]
@@ -167,8 +170,8 @@ def for_length(
 
     What a step adds to a free flight is proportional to its length, so their quotient is
     extrapolated quadratically from the midpoints of the three steps. `solve` extrapolates
-    steps of equal lengths: the differences are chosen such that it finds this value, or the
-    last one.
+    steps of equal lengths: the differences are chosen such that all candidates but the
+    first, which is the last value, are this value.
     """
     ends = np.cumsum(stages)
     # The midpoint of a backward stage may lie outside of the step, hence the clipping.

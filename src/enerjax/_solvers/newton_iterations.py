@@ -21,6 +21,10 @@ from .newton import Newton, Start
 
 # Thresholds of the method -----------------------------------------------------------------
 
+# The number of Jacobians of the first attempt, which takes whole corrections if they halve
+# the residual. Unknowns that pass through zero have large relative corrections, so that the
+# test of P. Deuflhard halves good ones; but coarse steps of stiff springs need that test.
+_FIRST_PATIENCE = 6
 # The number of Jacobians after which a search continues from another guess. Searches that
 # converge quadratically need fewer.
 PATIENCE = 12
@@ -155,24 +159,41 @@ def newton_iterations(
 ) -> _Iterate:
     """A search from several guesses, one after the other, until one converges.
 
-    The two damped attempts together use at most `max_jacobians` Jacobians.
+    From the first guess there are two attempts: the first takes whole corrections if they
+    halve the residual. The two attempts with P. Deuflhard's test use at most
+    `max_jacobians` Jacobians together, and the last ones do not halve corrections.
     """
-    guesses = jnp.stack([ravel_pytree(x)[0] for x in (start.guess, *start.others)])
+    guesses = [ravel_pytree(x)[0] for x in (start.guess, *start.others)]
     factors = residual.first_factors(start.factors, guesses[0])
     first = _first_iterate(factors, guesses[0], jnp.array(0), start.skip)
+    if len(guesses) == 1:
+        kind = _Kind(damped=True, whole=False)
+        return _attempt(residual, newton, start, first, max_jacobians, kind)
+    guesses = jnp.stack([guesses[0], *guesses])
     num_attempts = guesses.shape[0]
-    if num_attempts == 1:
-        return _attempt(residual, newton, start, first, max_jacobians, True)
-    limits = [PATIENCE, max_jacobians - PATIENCE, *[_UNDAMPED_PATIENCE] * num_attempts]
+    limits = [_FIRST_PATIENCE, PATIENCE, max_jacobians - PATIENCE]
+    limits += [_UNDAMPED_PATIENCE] * num_attempts
 
     def attempt(carry: tuple[Count, _Iterate]) -> tuple[Count, _Iterate]:
         k, last = carry
         begin = _first_iterate(last.factors, guesses[k], last.corrections, start.skip)
         limit = jnp.asarray(limits[:num_attempts])[k]
-        return k + 1, _attempt(residual, newton, start, begin, limit, k < 2)
+        kind = _Kind(damped=k < 3, whole=k == 0)
+        return k + 1, _attempt(residual, newton, start, begin, limit, kind)
 
     unfinished = lambda carry: ~carry[1].done & (carry[0] < num_attempts)
     return jax.lax.while_loop(unfinished, attempt, (jnp.array(0), first))[1]
+
+
+class _Kind(NamedTuple):
+    """What an attempt does with a correction that does not pass P. Deuflhard's test.
+
+    - `damped`: whether it is halved.
+    - `whole`: whether it is taken all the same if it has halved the residual.
+    """
+
+    damped: Flag | bool
+    whole: Flag | bool
 
 
 def _first_iterate(
@@ -205,7 +226,7 @@ def _attempt(
     start: Start,
     first: _Iterate,
     max_jacobians: Count | int,
-    damped: Flag | bool,
+    kind: _Kind,
 ) -> _Iterate:
     """A search from one guess."""
     powers = powers_of(first.x)
@@ -222,7 +243,7 @@ def _attempt(
         iterate = jax.lax.while_loop(lambda c: c.stale, linearise, iterate)
         correction = _propose(residual, iterate, start.least, powers)
         verdict = _classify(iterate, correction, newton, powers)
-        return _next_iterate(iterate, correction, verdict, damped, powers)
+        return _next_iterate(iterate, correction, verdict, kind, powers)
 
     unfinished = lambda c: (
         ~(c.done | c.broken) & ~(c.stale & (c.jacobians >= max_jacobians))
@@ -334,7 +355,7 @@ def _next_iterate(
     iterate: _Iterate,
     correction: _Correction,
     verdict: _Verdict,
-    damped: Flag | bool,
+    kind: _Kind,
     powers: Powers,
 ) -> _Iterate:
     """Accepts the correction, halves the one before, or requests a new Jacobian."""
@@ -342,13 +363,17 @@ def _next_iterate(
     taken = fresh | correction.shrinks | verdict.is_root
     # The second correction with a Jacobian estimates the error after the first one. If it
     # has not decreased enough and is larger than round-off, the first one is halved
-    # (P. Deuflhard's natural monotonicity test). Unknowns that pass through zero have large
-    # relative corrections, so it also suffices if the first one has halved the residual.
+    # (P. Deuflhard's natural monotonicity test).
     is_second = ~fresh & (iterate.contraction == 0) & (iterate.size > powers.small)
     is_monotone = correction.contraction <= 1 - 0.25 * fraction
-    is_monotone = is_monotone | (correction.defect <= 0.5 * iterate.defect)
+    # `correction.defect` is the residual after the first correction.
+    is_monotone = is_monotone | (kind.whole & (correction.defect <= 0.5 * iterate.defect))
     halves = (
-        damped & is_second & ~is_monotone & ~verdict.done & (fraction > _LEAST_FRACTION)
+        kind.damped
+        & is_second
+        & ~is_monotone
+        & ~verdict.done
+        & (fraction > _LEAST_FRACTION)
     )
     fraction = jnp.where(halves, 0.5 * fraction, jnp.ones_like(fraction))
     x_otherwise = jnp.where(halves, iterate.x + fraction * iterate.step, iterate.x)

@@ -27,8 +27,8 @@ class Places(Indices):
       positions, where a block is smaller than the largest one. `read`: the same with the
       first row of the block at padded positions, whose values are not used.
     - `padding`: ones on the diagonal at padded positions.
-    - `coupled`: whether an entry of the blocks can be nonzero, shape `(size, size)`. Rows
-      of a block are coupled if they have the same number in `parts`.
+    - `coupled`: whether an entry can be nonzero in any of the blocks, shape `(size, size)`.
+      Rows of a block are coupled if they have the same number in `parts`.
     - `back`: the position of each row in the blocks, and `within`: in its own block.
     """
 
@@ -71,16 +71,16 @@ class BlockDiagonal(eqx.Module):
 
     def __matmul__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         by_block = at_places(x, self.places.read)[:, None, :]
-        products = self.known_zeros(self.blocks) * by_block
+        products = self.with_known_zeros(self.blocks) * by_block
         return at_places(jnp.sum(products, axis=-1).ravel(), self.places.back)
 
     def __rmatmul__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         return self @ x  # symmetric
 
-    def known_zeros(self, blocks: Float[Array, "*many size size"]) -> Array:
-        """Blocks of this matrix whose zeros are known when a program is made.
+    def with_known_zeros(self, blocks: Float[Array, "*many size size"]) -> Array:
+        """Blocks of this matrix, with constants for the entries that are always zero.
 
-        Products with known zeros cost nothing.
+        Products with them cost nothing.
         """
         return jnp.where(self.places.coupled, blocks, 0)
 

@@ -216,7 +216,7 @@ def _weighted(
     if isinstance(weight, BlockDiagonal):
         none = jnp.zeros((1, *weight.blocks.shape[1:]), rows.dtype)
         blocks = at_places(jnp.concatenate([weight.blocks, none]), tables.touched)
-        blocks = weight.known_zeros(blocks)
+        blocks = weight.with_known_zeros(blocks)
     else:
         blocks = weight[None, None]
     return rows, jnp.sum(blocks * rows[:, :, None, :], axis=-1)
