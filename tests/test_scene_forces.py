@@ -30,7 +30,6 @@ def wheel():
 OMEGA = np.logspace(-3, 4, 8)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "scheme",
     [
@@ -40,6 +39,7 @@ OMEGA = np.logspace(-3, 4, 8)
         ej.EnergyDecaying(1.0),
     ],
 )
+@pytest.mark.slow_for("scheme1", "scheme2", "scheme3")
 def test_a_torsion_damper_never_creates_energy_in_steps_of_any_length(scheme):
     """`h = 1` and frequencies from 1e-3 to 1e4; critical dampers and weak ones."""
     system, start, args = wheel().build()

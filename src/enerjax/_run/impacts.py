@@ -147,6 +147,19 @@ class Impacts(eqx.Module):
         first = rows.first_row(q, model.args)
         return -rows.resting * multipliers[first : first + len(self.impacts)]
 
+    def of_closed(
+        self, model: AbstractModel, q: Coordinates, multipliers: Multipliers
+    ) -> Multipliers:
+        """The multipliers of a step, with zeros for the gaps that are open.
+
+        The equations of a step hold those to round-off of zero.
+        """
+        rows = model.system.constraint
+        assert isinstance(rows, _WithGaps)
+        first = rows.first_row(q, model.args)
+        gaps = slice(first, first + len(self.impacts))
+        return multipliers.at[gaps].multiply(rows.resting)
+
     def without_gaps(self, model: AbstractModel, q: Coordinates, rows: Array) -> Array:
         """Rows of the constraints, without those of the gaps."""
         constraint = model.system.constraint

@@ -224,7 +224,12 @@ def attempt_with_events(
     energies = eqx.tree_at(
         lambda x: x.impact, out.energies, changed.lost, is_leaf=lambda x: x is None
     )
-    out = eqx.tree_at(lambda x: (x.state, x.energies), out, (changed.state, energies))
+    multipliers = watcher.of_closed(model, before.state.q, out.multipliers)
+    out = eqx.tree_at(
+        lambda x: (x.state, x.energies, x.multipliers),
+        out,
+        (changed.state, energies, multipliers),
+    )
     after, attempt = _advanced(stepper, before, live, place, out, verdict)
     search = select(found.searches & live, found.search, no_search(length.dtype))
     waiting = eqx.tree_at(lambda x: x.search, watch, search)

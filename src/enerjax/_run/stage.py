@@ -233,7 +233,8 @@ def _prepared(
         guess=scaled(jax.tree.map(jnp.add, flight, predicted(memory))),
         # The extrapolated guess can lie beyond a fold of the step equations. A free flight
         # usually does not, and a fraction of it does not if bodies rotate far in a step.
-        others=tuple(scaled(shortened(flight, part)) for part in (1.0, 0.5, 0.25)),
+        # Stiff springs can reverse the motion, and a search must then begin at rest.
+        others=tuple(scaled(shortened(flight, part)) for part in (1.0, 0.5, 0.25, 0.0)),
         factors=jax.tree.map(extrapolated, memory.factors),
     )
 

@@ -126,6 +126,12 @@ class Watcher(eqx.Module):
             return jnp.zeros((len(self.events),), bool)
         return self._of_events(resting_of(model) > 0)
 
+    def of_closed(self, model: AbstractModel, q: Coordinates, multipliers: Array) -> Array:
+        """The multipliers of a step, with zeros for the gaps that are open."""
+        if not self.can_rest:
+            return multipliers
+        return self.impacts.of_closed(model, q, multipliers)
+
     def contact_forces(
         self, model: AbstractModel, q: Coordinates, multipliers: Array
     ) -> Float[Array, " events"]:

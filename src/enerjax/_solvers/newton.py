@@ -39,12 +39,15 @@ class Newton(eqx.Module):
     **Restarts.** A search that becomes non-finite, or has not converged with 12 Jacobians,
     begins again from a second guess. If that fails too, it begins again from further
     guesses without damping, because a damped search can end at a local minimum of the
-    residual that is no root.
+    residual that is no root. The last guess of a step is rest.
 
     **Arguments:**
 
     - `rtol`: bound on the predicted error, in units of round-off of the dtype.
-    - `atol`: bound on the residual, in the same units.
+    - `atol`: bound on the residual, in the same units. The error that a search leaves can
+      have the same sign in every step, and the energy of a run can then change by about
+      one unit of round-off per step. With `Newton(rtol=1e-6, atol=1e-3)` only the random
+      walk of rounding is left (heavy top: two corrections a step more).
     - `linear_solver`: the solver for the corrections and for derivatives of the root. An
       `AbstractSparseSolver`, such as `KLU()`, receives the structurally nonzero entries of
       the Jacobian; a solver of lineax receives the dense Jacobian. By default the size and

@@ -20,7 +20,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array
 
-from ..jaxprs import evaluate, interpret, is_known, name_of, wrapped_program
+from ..jaxprs import interpret, is_known, name_of, wrapped_program
 from ..numpy_primitives import as_rows, evaluated, moved
 from ..primitives import (
     CONTRACTION,
@@ -234,8 +234,11 @@ def _added(primitive: Any, values: list[_Value], params: Any, avals: Any) -> lis
         return _everything(primitive, values, params, avals)
     (aval,) = avals
     count, width = int(np.prod(aval.shape, dtype=int)), _width(values)
+    # The operation of the program adds numbers of its own dtype, which cannot be places.
     zero = jnp.zeros(aval.shape)
-    fall = lambda u: evaluate(primitive, [zero, index, u], params)[0]
+    names = "dimension_numbers", "indices_are_sorted", "unique_indices", "mode"
+    how = {name: params[name] for name in names}
+    fall = lambda u: jax.lax.scatter_add(zero, index, u, **how)
     _, pull = jax.vjp(fall, jnp.zeros(np.shape(updates)))
     numbers = (1 + jnp.arange(count, dtype=zero.dtype)).reshape(aval.shape)
     target = np.asarray(pull(numbers)[0]).astype(int).ravel() - 1
