@@ -6,20 +6,46 @@ from seeded_fault import Fault, of
 FAULTS = (
     # Solvers ----------------------------------------------------------------------------
     Fault(
-        "band: no pivoting by hand",
-        "_solvers/linear/dense.py",
-        "jnp.where(sizes == most, numbers, num_rows - 1)",
-        "jnp.where(sizes > 0, numbers, num_rows - 1)",
-        "The elimination of narrow bands takes the first pivot that is not zero.",
-        of("large_systems::test_a_band_is_cut_into_the_blocks_that_it_is_made_of"),
+        "blocks: multipliers before their bodies",
+        "_solvers/linear/elimination_order.py",
+        "    heap = [(degree(k), k) for k in left if not pending[k]]\n",
+        "    pending = [0] * len(near)\n    heap = [(degree(k), k) for k in left]\n",
+        "Multipliers are eliminated before the coordinates that make their block regular.",
+        of("large_systems::test_bodies_with_constraints_are_eliminated_in_blocks"),
     ),
     Fault(
-        "band: colours of a dense matrix",
+        "blocks: transposed in the same order",
+        "_solvers/linear/block_elimination.py",
+        "jnp.asarray(self.substitutions[::-1])",
+        "jnp.asarray(self.substitutions)",
+        "The transposed substitution takes the products in the order of the other one.",
+        of("large_systems::test_bodies_with_constraints_are_eliminated_in_blocks"),
+    ),
+    Fault(
+        "colours: of a dense matrix",
         "_solvers/linear/jacobian.py",
         "        return jnp.where(self._nonzero, columns, 0)\n",
         "        return columns\n",
         "Dense Jacobians whose columns are found together have entries of other columns.",
         of("large_systems::test_a_dense_matrix_of_columns_that_are_found_together"),
+    ),
+    Fault(
+        "slices: written where they were found",
+        "_programs/machine_code/loops.py",
+        "sum(x is after for x in read) == 1",
+        "True",
+        "An array that a pass reads after it has changed it is the one before.",
+        of("machine_code::test_loops_that_change_slices"),
+    ),
+    Fault(
+        "guesses: none at rest",
+        "_run/stage.py",
+        "for part in (1.0, 0.5, 0.25, 0.0)",
+        "for part in (1.0, 0.5, 0.25)",
+        "Searches do not begin at rest where stiff springs reverse the motion.",
+        of(
+            "scene_forces::test_a_torsion_damper_never_creates_energy_in_steps_of_any_length"
+        ),
     ),
     Fault(
         "inverse: pivots with their sign",

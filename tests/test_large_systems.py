@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 import enerjax as ej
 from enerjax._programs.sparsity.pattern import jacobian_pattern
 from enerjax._solvers.linear.block_diagonal import BlockDiagonal, hessian, inverse_of
-from enerjax._solvers.linear.block_tridiagonal import Band
+from enerjax._solvers.linear.block_elimination import BlockElimination
 from enerjax._solvers.linear.jacobian import Dense, RowPattern
 
 from .helpers import EPS, SCHEMES
@@ -94,34 +94,78 @@ def test_a_pattern_that_is_too_dense_is_none(monkeypatch):
     assert np.ptp(run.audit.energy) <= 100 * EPS * run.audit.energy[0]  # round-off
 
 
-def _banded(size, rng):
-    """A shuffled band without a dominant, or even a full, diagonal."""
+def _with_multipliers(graph, rng, own=3, rows=2):
+    """The matrix of bodies, and of constraints along the edges of a graph of them.
+
+    The unknowns are shuffled. Blocks of the bodies are not symmetric, and couple
+    neighbours; the diagonal block of the multipliers is zero.
+    """
+    bodies, joints = 1 + max(map(max, graph)), len(graph)
+    size = own * bodies + rows * joints
     matrix = np.zeros((size, size))
-    for k in range(size):
-        low, high = max(0, k - 4), min(size, k + 4)
-        matrix[k, low:high] = rng.normal(size=high - low) * (rng.random(high - low) < 0.6)
-    matrix[np.arange(size), np.arange(size)] *= rng.random(size) < 0.4
-    matrix += np.diag(np.ones(size - 1), 1)
+    place = lambda k: slice(own * k, own * (k + 1))
+    for k in range(bodies):
+        matrix[place(k), place(k)] = 4 * np.eye(own) + rng.normal(size=(own, own))
+    for number, (a, b) in enumerate(graph):
+        joint = own * bodies + rows * number + np.arange(rows)
+        matrix[place(a), place(b)] = 0.3 * rng.normal(size=(own, own))
+        matrix[place(b), place(a)] = 0.3 * rng.normal(size=(own, own))
+        for k in (a, b):
+            matrix[joint, place(k)] = rng.normal(size=(rows, own))
+            matrix[place(k), joint] = rng.normal(size=(own, rows))
+    owners = np.concatenate([np.arange(own * bodies), -1 - np.arange(rows * joints)])
     order = rng.permutation(size)
-    return matrix[order][:, order]
+    return matrix[order][:, order], owners[order]
 
 
-@pytest.mark.parametrize("size", [30, 101, 300])
-@pytest.mark.slow_for("300")
-def test_a_shuffled_band_is_found_and_solved(size):
-    rng = np.random.default_rng(size)
-    matrix, right = _banded(size, rng), rng.normal(size=size)
-    band = Band(csr_array(matrix != 0))
-    assert band.width <= 12
-    entries = band.evaluate(lambda x: jnp.asarray(matrix) @ x, jnp.zeros(size))
-    factors = band.empty(size, float).renewed(entries)
-    x = factors.solve(jnp.asarray(right))
-    bound = 1e3 * size * EPS * np.abs(matrix).max()  # round-off
-    size_of = np.abs(np.linalg.solve(matrix, right)).max()
-    assert np.max(np.abs(matrix @ x - right)) <= bound * size_of
-    y = jax.vjp(factors.solve, right)[1](jnp.asarray(right))[0]
-    size_of = np.abs(np.linalg.solve(matrix.T, right)).max()
-    assert np.max(np.abs(matrix.T @ y - right)) <= bound * size_of
+GRAPHS = {
+    "chain": [(k, k + 1) for k in range(40)],
+    "tree": [((k - 1) // 2, k) for k in range(1, 40)],
+    "ring": [(k, (k + 1) % 30) for k in range(30)],
+    "ladder": [(k, k + 2) for k in range(30)] + [(k, k + 1) for k in range(0, 30, 6)],
+    "apart": [(2 * k, 2 * k + 1) for k in range(20)],
+}
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+def test_bodies_with_constraints_are_eliminated_in_blocks(name):
+    rng = np.random.default_rng(len(name))
+    matrix, owners = _with_multipliers(GRAPHS[name], rng)
+    size = owners.size
+    elimination = BlockElimination(csr_array(matrix != 0), owners)
+    assert elimination.width <= 16
+    # One product for each pair of neighbours: far below those of a dense matrix.
+    assert elimination.changes.shape[0] * elimination.width**3 < 0.03 * size**3
+    entries = elimination.evaluate(lambda x: jnp.asarray(matrix) @ x, jnp.zeros(size))
+    factors = elimination.empty(size, float).renewed(entries)
+    right = rng.normal(size=size)
+    bound = 100 * np.linalg.cond(matrix) * EPS  # round-off
+    for found, of in (
+        (factors.solve(jnp.asarray(right)), matrix),
+        (factors.solve_transposed(jnp.asarray(right)), matrix.T),
+    ):
+        exact = np.linalg.solve(of, right)
+        assert np.max(np.abs(found - exact)) <= bound * np.max(np.abs(exact))
+
+
+def test_blocks_are_eliminated_in_lanes_of_their_own():
+    """Each lane exchanges rows as its own numbers require."""
+    rng = np.random.default_rng(5)
+    matrix, owners = _with_multipliers(GRAPHS["chain"], rng)
+    elimination = BlockElimination(csr_array(matrix != 0), owners)
+    scales = rng.normal(size=(6, owners.size)) + 3
+    right = rng.normal(size=(6, owners.size))
+
+    def solution(scale, right):
+        apply = lambda x: scale * (jnp.asarray(matrix) @ x)
+        entries = elimination.evaluate(apply, jnp.zeros(owners.size))
+        return elimination.empty(owners.size, float).renewed(entries).solve(right)
+
+    lanes = jax.jit(jax.vmap(solution))(scales, right)
+    bound = 100 * np.linalg.cond(matrix) * EPS  # round-off
+    for found, scale, given in zip(lanes, scales, right, strict=True):
+        exact = np.linalg.solve(matrix, given / scale)
+        assert np.max(np.abs(found - exact)) <= bound * np.max(np.abs(exact))
 
 
 def test_a_dense_matrix_of_columns_that_are_found_together():
@@ -288,23 +332,3 @@ def test_a_chain_that_cracks_like_a_whip_keeps_energy_and_constraints(num_links)
     assert np.ptp(run.audit.energy) <= 1e-11 * turnover  # solver
     assert np.max(np.abs(run.audit.constraint)) <= 1e-9 * length**2
     assert np.max(np.abs(run.audit.constraint_rate)) <= 1e-9 * length**2
-
-
-@pytest.mark.parametrize("diagonal", [True, False])
-@pytest.mark.slow_for("False")
-def test_a_band_is_cut_into_the_blocks_that_it_is_made_of(diagonal):
-    """Blocks as wide as the band would be of seven unknowns; rows must be exchanged where
-    the diagonal is small."""
-    neighbours = np.abs(np.subtract.outer(np.arange(30), np.arange(30))) <= 1
-    rng = np.random.default_rng(0)
-    order = rng.permutation(120)
-    pattern = np.kron(neighbours, np.ones((4, 4)))[order][:, order]
-    band = Band(csr_array(pattern != 0))
-    assert band.width == 4
-    matrix = pattern * rng.normal(size=pattern.shape)
-    matrix = matrix if diagonal else matrix * (1 - (1 - 1e-12) * np.eye(120))
-    entries = band.evaluate(lambda x: jnp.asarray(matrix) @ x, jnp.zeros(120))
-    right = rng.normal(size=120)
-    x = band.empty(120, float).renewed(entries).solve(jnp.asarray(right))
-    size = np.abs(np.linalg.inv(matrix)).max()
-    np.testing.assert_allclose(matrix @ x, right, atol=1e4 * size * EPS)  # round-off

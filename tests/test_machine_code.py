@@ -472,6 +472,67 @@ def test_tables_that_are_looked_up(length):
     assert jax.jit(in_one_function(follow))(0.9) == follow(0.9)
 
 
+def _change(blocks, at, value):
+    return jax.lax.dynamic_update_slice(blocks, value[None], (at, *[0] * value.ndim))
+
+
+def _chain_of_blocks(blocks, table):
+    """Each pass changes one block by two others; some it changes more than once."""
+
+    def body(blocks, row):
+        at, one, other = row
+        return _change(blocks, at, blocks[at] - blocks[one] @ blocks[other].T), at
+
+    return jax.lax.scan(body, blocks, table)
+
+
+def _blocks_that_are_read_again(blocks, table):
+    """The array that is changed is needed as a whole too."""
+
+    def body(carry, row):
+        blocks, total = carry
+        blocks = _change(blocks, row[0], blocks[row[1]] + 1)
+        return (blocks, total + blocks[row[2]]), None
+
+    return jax.lax.scan(body, (blocks, blocks[0]), table)[0]
+
+
+def _blocks_while_small(blocks, table):
+    """A loop whose number of passes is not known, with two slices and their exchange."""
+
+    def body(carry):
+        k, blocks, rows = carry
+        at, one, other = table[k]
+        new = 0.5 * blocks[one] + rows[other][None]
+        rows = jax.lax.dynamic_update_slice(rows, blocks[at][:1], (one, 0))
+        return k + 1, _change(blocks, at, new), rows
+
+    within = lambda carry: (carry[0] < 9) & (jnp.max(jnp.abs(carry[1])) < 2.0)
+    return jax.lax.while_loop(within, body, (0, blocks, blocks[:, 0]))
+
+
+@pytest.mark.parametrize(
+    "fn", [_chain_of_blocks, _blocks_that_are_read_again, _blocks_while_small]
+)
+@pytest.mark.parametrize("width", [1, 4, 7])
+def test_loops_that_change_slices(fn, width):
+    rng = np.random.default_rng(width)
+    blocks = 0.3 * jnp.asarray(rng.normal(size=(6, width, width)))
+    table = jnp.asarray(rng.integers(0, 6, size=(11, 3)))
+    whole = in_one_function(fn)
+    assert is_compiled(whole, blocks, table)
+    plain, found = jax.jit(fn)(blocks, table), jax.jit(whole)(blocks, table)
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-13, atol=1e-13)
+    jax.tree.map(close, found, plain)  # round-off
+    # Lanes of which the first end early.
+    lanes = jnp.stack([4 * blocks, 2 * blocks, blocks, 0.5 * blocks, 0.1 * blocks])
+    batch = jax.jit(jax.vmap(whole, (0, None)))(lanes, table)
+    jax.tree.map(close, batch, jax.jit(jax.vmap(fn, (0, None)))(lanes, table))
+    tables = jnp.stack([(table + k) % 6 for k in range(5)])
+    batch = jax.jit(jax.vmap(whole))(lanes, tables)
+    jax.tree.map(close, batch, jax.jit(jax.vmap(fn))(lanes, tables))
+
+
 def test_single_precision_and_whole_numbers():
     def fn(x, k):
         small = x.astype(jnp.float32)

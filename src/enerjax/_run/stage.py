@@ -149,6 +149,7 @@ def solve(
         least=prepared.least,
         chord=_chord(scheme) if alone or wait is not None else None,
         by_chord=True if wait is None else wait == 0,
+        owners=owners_of(prepared.guess),
         rarely=rarely or wait is not None,
     )
     step = scheme, problem, model, start, memory, prepared
@@ -330,12 +331,31 @@ def _with_multipliers(
 
     `y` are those at the same place of the trees `others`.
     """
-    is_increment = lambda x: isinstance(x, Increment)
 
     def change(x: Any, *y: Any) -> Any:
-        return eqx.tree_at(_multipliers, x, new(x, *y)) if is_increment(x) else x
+        return eqx.tree_at(_multipliers, x, new(x, *y)) if _is_increment(x) else x
 
-    return jax.tree.map(change, z, *others, is_leaf=is_increment)
+    return jax.tree.map(change, z, *others, is_leaf=_is_increment)
+
+
+def owners_of(z: PyTree[Any]) -> tuple[int, ...] | None:
+    """The number of the coordinate that each unknown belongs to, or `-1 - k` for a
+    multiplier of row `k`. `None` if there are other unknowns than those of increments."""
+    increments = jax.tree.leaves(z, is_leaf=_is_increment)
+    if not all(map(_is_increment, increments)):
+        return None
+    owners: list[int] = []
+    for x in increments:
+        size, num_momenta = x.rate.size, x.momentum.size
+        first = 0 if num_momenta == size else size
+        owners += (-1 - k for k in range(x.impulse.size))
+        owners += [*range(size), *range(first, first + num_momenta)]
+        owners += (-1 - k for k in range(x.velocity_impulse.size))
+    return tuple(owners)
+
+
+def _is_increment(x: Any) -> bool:
+    return isinstance(x, Increment)
 
 
 def _multipliers(x: Increment) -> tuple[Multipliers, JointMultipliers]:

@@ -51,10 +51,10 @@ class Newton(eqx.Module):
     - `linear_solver`: the solver for the corrections and for derivatives of the root. An
       `AbstractSparseSolver`, such as `KLU()`, receives the structurally nonzero entries of
       the Jacobian; a solver of lineax receives the dense Jacobian. By default the size and
-      the sparsity decide. It is a banded solver if the unknowns can be ordered such that
-      the Jacobian is a narrow band, else an inverse in plain array operations up to 32
-      unknowns (without a chord method in any case), and LAPACK beyond.
-      Derivatives are as accurate as the solutions of the solver.
+      the sparsity decide: an elimination in blocks along the graph of the bodies, or if
+      that is no cheaper, an inverse in plain array operations up to 32 unknowns (without a
+      chord method in any case) and LAPACK beyond. The elimination exchanges rows within
+      its blocks. Derivatives are as accurate as the solutions of the solver.
 
     Raises a `TypeError` for a `linear_solver` of another type, and a `ValueError` for a
     bound that is not positive.
@@ -102,6 +102,8 @@ class Start(eqx.Module):
     - `by_chord`: whether to try the chord method first, where the equations have one.
     - `regularisation`: the numbers added to the diagonal of a Jacobian that may be
       singular, one for each unknown; see `find_root`.
+    - `owners`: a number for each unknown, negative for multipliers, in the order of
+      `ravel_pytree`; `None` where nothing is known. See `elimination_orders`.
     - `rarely`: whether Jacobians are needed rarely, so that a program is chosen that
       compiles quickly.
     - `least`: the scaled size below which unknowns are round-off. Corrections are measured
@@ -115,4 +117,5 @@ class Start(eqx.Module):
     by_chord: Flag
     regularisation: PyTree[Array] | None
     least: Scalar
+    owners: tuple[int, ...] | None = eqx.field(static=True, default=None)
     rarely: bool = eqx.field(static=True, default=False)

@@ -144,6 +144,7 @@ def find_root(
     least: Scalar | float = 1.0,
     chord: Chord | None = None,
     by_chord: Flag | bool = True,
+    owners: tuple[int, ...] | None = None,
     rarely: bool = False,
 ) -> Root:
     """A root of `fn(y, args)`. Failures are reported in the `Root`, not raised.
@@ -166,7 +167,8 @@ def find_root(
     With a `chord`, and if `by_chord` is true, `Newton` first tries the chord method, and
     uses the exact Jacobian only where that fails; `ChordAlone` finds no root there. The
     root and its derivatives are those of `fn` in either case. If Jacobians are needed
-    `rarely`, their program is one that compiles quickly.
+    `rarely`, their program is one that compiles quickly. `owners` tells coordinates from
+    multipliers; with them large sparse Jacobians are eliminated in blocks.
     """
     flat, _ = ravel_pytree(guess)
     start = Start(
@@ -177,6 +179,7 @@ def find_root(
         by_chord=jnp.asarray(by_chord),
         regularisation=regularisation,
         least=jnp.asarray(least, flat.dtype),
+        owners=owners,
         rarely=rarely,
     )
     start = jax.lax.stop_gradient(start)

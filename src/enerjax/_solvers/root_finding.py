@@ -92,6 +92,7 @@ def with_jacobian(
         args,
         root_finder.linear_solver if isinstance(root_finder, Newton) else None,
         regularisation,
+        owners=start.owners,
         rarely=start.rarely,
         small=SMALL if chord is None else 0,
     )

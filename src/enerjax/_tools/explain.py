@@ -10,7 +10,7 @@ from .._operators import AbstractModel, Increment, SeparableModel
 from .._programs import num_operations, simplified, why_not_one_function
 from .._run.inputs import prepare
 from .._run.loop import dispensable_newton, Stepper
-from .._run.stage import free_flight, is_chord_alone, step_problem
+from .._run.stage import free_flight, is_chord_alone, owners_of, step_problem
 from .._run.step import model_for
 from .._run.step_sizes import End, EqualSteps
 from .._solvers import ChordAlone, flattened, linearisable, Newton, RootFinder, SMALL
@@ -128,6 +128,7 @@ def _explained(
             (scheme.stage, problem),
             root_finder.linear_solver,
             redundant,
+            owners=owners_of(z),
             small=0 if by_chord else SMALL,
         ).form
         jacobian = form.description(flat.size)

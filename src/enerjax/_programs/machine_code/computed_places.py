@@ -62,7 +62,7 @@ def _at_computed(
     return self.cells(dtype, objects(flat, tuple(kept)), lane, n)
 
 
-def _starts(
+def starts_of_slice(
     self: "Evaluation", starts: list[Value], shape: Sequence[int], sizes: Sequence[int]
 ) -> list[Number]:
     """Where a slice begins, moved such that it lies inside."""
@@ -75,7 +75,7 @@ def _starts(
 
 def dynamic_slice(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
     (x, *starts), sizes = values, eqn.params["slice_sizes"]
-    return [_at_computed(self, x, _starts(self, starts, x.shape, sizes), sizes)]
+    return [_at_computed(self, x, starts_of_slice(self, starts, x.shape, sizes), sizes)]
 
 
 def dynamic_update_slice(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
@@ -84,7 +84,7 @@ def dynamic_update_slice(self: "Evaluation", eqn: Any, values: list[Value]) -> l
     graph, dtype = self.graph, dtype_of(x)
     if math.prod(update.shape) == 0:
         return [x]
-    begins = _starts(self, starts, x.shape, update.shape)
+    begins = starts_of_slice(self, starts, x.shape, update.shape)
     memory, strides = self.cellar.regular(update)
     first = int(memory.places.ravel()[0])
 

@@ -84,7 +84,8 @@ class Emission:
             if x.op == "load":
                 self._uniform[x] = not x.lanes and x.extra in self._counters
             else:
-                known = x.op != "dynamic" and not x.op.startswith("reduce")
+                of_passes = x.op == "dynamic" and x.extra[0] < CONSTANTS
+                known = not of_passes and not x.op.startswith("reduce")
                 self._uniform[x] = known and all(map(self.is_uniform, x.operands))
         return self._uniform[x]
 

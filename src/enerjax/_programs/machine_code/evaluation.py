@@ -94,7 +94,13 @@ class Evaluation:
         return self.move(jax.lax.concatenate_p, parts, dict(dimension=0))[0]
 
     def closed(self, closed: Any, args: Sequence[Any]) -> list[Value]:
-        return self.outputs(closed.jaxpr, list(map(known_constant, closed.consts)), args)
+        return self.program(closed.jaxpr, closed.consts, args)
+
+    def program(
+        self, jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]
+    ) -> list[Value]:
+        """The outputs of a program with these constants."""
+        return self.outputs(jaxpr, list(map(known_constant, consts)), args)
 
     def function(self, fn: Callable, *values: Value) -> list[Value]:
         """The outputs of a function of JAX, traced for these arguments."""

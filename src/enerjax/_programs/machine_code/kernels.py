@@ -332,15 +332,32 @@ class Kernel(Instructions):
                 pointers.append(self._pointer(self._say(f"add i64 {one}, {index}")))
             self._put_each(value, dtype, pointers)
             return
+        if counter and not self.emission.is_uniform(counter[0]):
+            pointers = self._pointers_of_passes(counter[0], row, index)
+            if mask is not None:
+                value = self._where(mask, dtype, value, self._load_each(pointers, dtype))
+            self._put_each(value, dtype, pointers)
+            return
         if counter:
             index = self._say(f"add i64 {self._row_offset(counter[0], row)}, {index}")
         pointer = self._wide_pointer(index)
         if mask is not None:
-            old = self._load_vector(pointer, dtype)
-            on = self._number_at(mask, "b1")
-            t = self._t(dtype)
-            value = self._say(f"select {self._t('b1')} {on}, {t} {value}, {t} {old}")
+            value = self._where(mask, dtype, value, self._load_vector(pointer, dtype))
         self._put(value, dtype, pointer)
+
+    def _where(self, mask: int, dtype: str, new: str, old: str) -> str:
+        """The new numbers of the passes of a mask, and the old ones of others."""
+        on, t = self._number_at(mask, "b1"), self._t(dtype)
+        return self._say(f"select {self._t('b1')} {on}, {t} {new}, {t} {old}")
+
+    def _pointers_of_passes(self, offset: Node, row: int, index: str | int) -> list[str]:
+        """Where each pass keeps its own number, in a row of its own."""
+        numbers, pointers = self._value(offset, "i8"), []
+        for k in range(WIDTH):
+            one = self._say(f"mul i64 {self._element(numbers, 'i64', k)}, {row}")
+            one = self._say(f"mul i64 {self._say(f'add i64 {one}, {index}')}, {WIDTH}")
+            pointers.append(self._pointer(self._say(f"add i64 {one}, {k}"), "%w"))
+        return pointers
 
     def _row_offset(self, counter: Node, row: int) -> str:
         """The offset of the row of a pass, a single number."""

@@ -6,12 +6,14 @@ Operations of a body that do not depend on the carry are moved out of it.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, TYPE_CHECKING, TypeGuard
+from typing import Any, NamedTuple, TYPE_CHECKING, TypeGuard
 
 import numpy as np
+from jax.extend.core import Literal
 
 from ..counting import num_equations
 from ..jaxprs import parts_of_scan
+from .computed_places import starts_of_slice
 from .graph import Node, Number, Region
 from .values import (
     Block,
@@ -24,6 +26,7 @@ from .values import (
     MOST_CELLS,
     objects,
     shared,
+    strides_of,
     type_name,
     Unsupported,
     usual_lane,
@@ -219,11 +222,12 @@ def _lane(value: Value) -> int | None:
 
 
 def _block(
-    self: "Evaluation", value: Value, copies: int = 1
+    self: "Evaluation", value: Value, copies: int = 1, slices: Sequence[int] | None = None
 ) -> tuple[list[Block], np.ndarray]:
     """New cells for an array, and who owns them.
 
     The lanes of each number are neighbours. `copies` is the number of rows of such arrays.
+    An array of which a loop changes slices of a given shape has the lanes of these.
     """
     shape, region = value.shape, self.graph.current
     size, places = math.prod(shape), np.zeros(math.prod(shape), np.int64)
@@ -234,6 +238,10 @@ def _block(
     elif isinstance(value, Memory):
         found = self.cellar.columns(value.places.ravel())
         parts = [] if found is None else [*found[0], *([found[1]] if found[1].size else [])]
+    if slices is not None:
+        lane = usual_lane(tuple(slices))
+        lane = len(shape) - 1 if lane is None else lane
+        parts = [columns_along(np.arange(size).reshape(shape), lane).ravel()]
     if not parts:
         lane = usual_lane(shape)
         hint = self.rows_of.get(size) if len(shape) == 1 else None
@@ -264,6 +272,89 @@ def _same_through(jaxpr: Any, count: int, first: int, offset: int = 0) -> list[b
     return [a is b for a, b in zip(inputs, outs, strict=True)]
 
 
+class _Slice(NamedTuple):
+    """What a pass writes into an array of its carry, and the entry where this begins."""
+
+    value: Value
+    starts: list[Value]
+
+    def offset(
+        self, evaluation: "Evaluation", places: np.ndarray
+    ) -> tuple[Node | None, np.ndarray]:
+        """How far the slice lies behind the first one of the array, whose cells are given,
+        and the cells of that."""
+        graph, shape, offset = evaluation.graph, self.value.shape, 0
+        strides = strides_of(places)
+        assert strides is not None
+        starts = starts_of_slice(evaluation, self.starts, places.shape, shape)
+        for start, stride in zip(starts, strides, strict=True):
+            offset = graph.add("i8", offset, graph.multiply("i8", start, stride))
+        first = places[tuple(slice(0, n) for n in shape)]
+        if isinstance(offset, Node):
+            evaluation.cellar.place_of(offset, "i8")
+            return offset, first
+        return None, first + offset
+
+
+class _Body:
+    """The program of a pass, without its last operations on the carry.
+
+    Where the last operation on an array of the carry is to change a slice of it, the pass
+    only has to write the slice.
+
+    - `jaxpr`: what the program is without these operations. In place of such arrays it
+      returns their slices, and after all others, where the slices begin.
+    - `changes`: these operations, by the number of the array in the carry.
+    """
+
+    def __init__(self, closed: Any, count: int, first: int):
+        jaxpr = closed.jaxpr
+        self._consts, self._count = closed.consts, len(jaxpr.outvars)
+        inputs, outs = jaxpr.invars[first : first + count], list(jaxpr.outvars)
+        updates = {
+            eqn.outvars[0]: eqn
+            for eqn in jaxpr.eqns
+            if eqn.primitive.name == "dynamic_update_slice"
+        }
+        read = [*outs, *(x for eqn in jaxpr.eqns for x in eqn.invars)]
+        self.changes: dict[int, Any] = {}
+        for k, (before, after) in enumerate(zip(inputs, outs[:count], strict=True)):
+            eqn = None if isinstance(after, Literal) else updates.get(after)
+            if eqn is None or eqn.invars[0] is not before:
+                continue
+            if sum(x is after for x in read) == 1 and eqn.invars[1].aval.size:
+                self.changes[k] = eqn
+        for k, eqn in self.changes.items():
+            outs[k] = eqn.invars[1]
+            outs += eqn.invars[2:]
+        gone = {id(eqn) for eqn in self.changes.values()}
+        left = [eqn for eqn in jaxpr.eqns if id(eqn) not in gone]
+        self.jaxpr = _Program(jaxpr.constvars, jaxpr.invars, left, outs)
+
+    def shape_of_slices(self, number: int) -> tuple[int, ...] | None:
+        """The shape of the slices that passes change of an array of the carry."""
+        eqn = self.changes.get(number)
+        return None if eqn is None else eqn.invars[1].aval.shape
+
+    def __call__(self, evaluation: "Evaluation", values: Sequence[Value]) -> list[Any]:
+        """The outputs of a pass, with a `_Slice` for each array that it changes in part."""
+        outs: list[Any] = evaluation.program(self.jaxpr, self._consts, values)
+        outs = _as_types(outs, [x.aval for x in self.jaxpr.outvars])
+        starts = iter(outs[self._count :])
+        for k, eqn in self.changes.items():
+            outs[k] = _Slice(outs[k], [next(starts) for _ in eqn.invars[2:]])
+        return outs[: self._count]
+
+
+class _Program(NamedTuple):
+    """What is evaluated of a program of JAX."""
+
+    constvars: Sequence[Any]
+    invars: Sequence[Any]
+    eqns: Sequence[Any]
+    outvars: Sequence[Any]
+
+
 class _Carry:
     """The cells of a carry.
 
@@ -276,6 +367,7 @@ class _Carry:
         self_: "Evaluation",
         values: list[Value],
         same: list[bool],
+        body: _Body,
         takes_over: bool = False,
     ):
         self.evaluation = self_
@@ -285,13 +377,13 @@ class _Carry:
         self.places: list[np.ndarray | None] = []
         # The level from which the cells that are taken over can be read.
         self.ready = 0
-        for value, stays in zip(values, same, strict=True):
+        for k, (value, stays) in enumerate(zip(values, same, strict=True)):
             owners, places = [], None
             if takes_over and not stays and self._is_taken_over(value):
                 owners, places = value.owners, value.places
                 self.ready = max([self.ready, *(x.ready for x in owners)])
             elif not stays and math.prod(value.shape):
-                owners, places = _block(self_, value)
+                owners, places = _block(self_, value, slices=body.shape_of_slices(k))
             self.owners.append(owners)
             self.places.append(places)
 
@@ -312,7 +404,9 @@ class _Carry:
         """The values in a pass."""
         return self._in_cells(region, 0)
 
-    def commit(self, region: Region, results: list[Value], mask: int | None = None) -> None:
+    def commit(
+        self, region: Region, results: list["Value | _Slice"], mask: int | None = None
+    ) -> None:
         """Writes the values after a pass, after all else in it."""
         writes = [
             self._prepared(value, places, mask)
@@ -324,16 +418,20 @@ class _Carry:
             write(region, last)
 
     def _prepared(
-        self, value: Value, places: np.ndarray, mask: int | None
+        self, value: "Value | _Slice", places: np.ndarray, mask: int | None
     ) -> Callable[[Region, int], None]:
         """Writes a value from a level on, without lanes read from cells of the carry."""
-        evaluation = self.evaluation
+        evaluation, offset = self.evaluation, None
+        if isinstance(value, _Slice):
+            offset, places = value.offset(evaluation, places)
+            value = value.value
         graph, dtype = evaluation.graph, dtype_of(value)
         numbers, cells = _numbers(evaluation, value, places)
         pairs = []
         for x, at in zip(numbers, cells, strict=True):
-            if isinstance(x, Node) and x.op == "load" and _is_in_place(evaluation, x, at):
-                continue
+            if isinstance(x, Node) and x.op == "load" and offset is None:
+                if _is_in_place(evaluation, x, at):
+                    continue
             is_read = isinstance(x, Node) and x.op in ("load", "dynamic")
             if isinstance(at, int):
                 # Single numbers are all read before the first is written, but if they are
@@ -347,7 +445,7 @@ class _Carry:
         def write(region: Region, level: int) -> None:
             for x, at in pairs:
                 at_least = max(level, _level_of(x, region))
-                _store(evaluation, x, dtype, at, region, at_least, mask=mask)
+                _store(evaluation, x, dtype, at, region, at_least, offset, 1, mask)
 
         return write
 
@@ -374,7 +472,7 @@ class _Carry:
         ]
 
 
-def _is_at(value: Value, places: np.ndarray) -> bool:
+def _is_at(value: "Value | _Slice", places: np.ndarray) -> bool:
     """Whether an array is in these cells."""
     return isinstance(value, Memory) and np.array_equal(value.places, places)
 
@@ -426,16 +524,16 @@ def _scan(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
     body = Region(graph.current, is_wide=is_wide)
     counter_place = cellar.new(1, Block(body, 0))
     item = Scan(body, length, reverse, counter_place, is_wide)
-    cells = _Carry(self, carry, _same_through(jaxpr, count, first))
+    program = _Body(closed, count, first)
+    cells = _Carry(self, carry, _same_through(jaxpr, count, first), program)
     written = cells.begin()
     rows = [_rows_in_order(self, x) for x in rows]
     ends: list[Value] = []
     with _within(self, body):
         counter = graph.at(body, 0, "load", "i8", extra=counter_place)
         own = [_row(self, x, counter) for x in rows]
-        outs = self.closed(closed, [*consts, *cells.read(body), *own])
+        outs = program(self, [*consts, *cells.read(body), *own])
         wanted = eqn.outvars[count:]
-        outs = _as_types(outs, closed.out_avals)
         stacks = [
             None if type(var).__name__ == "DropVar" else _Stack(self, x, length)
             for x, var in zip(outs[count:], wanted, strict=True)
@@ -584,7 +682,8 @@ def _while(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
     item = While(head, before, body, flag_place)
     count = len(carry)
     same = _same_through(closed.jaxpr, count, second)
-    cells = _Carry(self, carry, same, takes_over=True)
+    program = _Body(closed, count, second)
+    cells = _Carry(self, carry, same, program, takes_over=True)
     written = cells.begin()
     with _within(self, head):
         # Loops in the condition must not change what the body reads.
@@ -596,8 +695,7 @@ def _while(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
         level = _level_of(flag, head)
         _store(self, flag, "b1", flag_place, head, level, mask=flag_place)
     with _within(self, body):
-        outs = self.closed(closed, [*inner, *cells.read(body)])
-        cells.commit(body, _as_types(outs, closed.out_avals), flag_place)
+        cells.commit(body, program(self, [*inner, *cells.read(body)]), flag_place)
     _finish(self, item, written, cells.ready)
     return cells.end(item.level)
 

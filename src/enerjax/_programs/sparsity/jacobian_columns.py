@@ -57,7 +57,26 @@ def batched_columns(
     They take longer to compute, but their program is compiled several times as fast.
     """
     _, push = jax.linearize(fn, x)
-    return jax.vmap(push, in_axes=1, out_axes=-1)(jnp.asarray(seeds, x.dtype))
+    products = [
+        jax.vmap(push, in_axes=1, out_axes=-1)(jnp.asarray(part, x.dtype))
+        for part in _apart(seeds)
+    ]
+    return products[0] if len(products) == 1 else jnp.concatenate(products, axis=-1)
+
+
+def _apart(seeds: Float[np.ndarray, "n k"]) -> list[Float[np.ndarray, "n part"]]:
+    """The columns, divided where one has no entries in the range of those before it.
+
+    In the program for multipliers alone the tangents of all coordinates are known zeros.
+    """
+    size, cuts, low, high = len(seeds), [], len(seeds), 0
+    for k, column in enumerate(seeds.T != 0):
+        if k and not np.any(column[low:high]):
+            cuts.append(k)
+            low, high = size, 0
+        low = min(low, int(np.argmax(column)))
+        high = max(high, size - int(np.argmax(column[::-1])))
+    return np.split(seeds, cuts, axis=1)
 
 
 class _Columns:

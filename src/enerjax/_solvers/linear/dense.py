@@ -23,7 +23,7 @@ from .norms import largest
 # Rows up to which plain operations beat LAPACK.
 SMALL = 32
 # Rows up to which the loop over columns is unrolled. Longer unrolled loops compile slowly.
-_UNROLLED = 8
+UNROLLED = 8
 # The same for definite matrices, for which no pivots are looked for.
 _UNROLLED_IF_DEFINITE = 16
 
@@ -141,7 +141,7 @@ def eliminated(
         return jnp.where(chosen[:, None], row[None], kept), place, order
 
     carry = panel, numbers, numbers
-    if count <= _UNROLLED:
+    if count <= UNROLLED:
         return functools.reduce(lambda c, k: column(k, c), range(count), carry)
     return jax.lax.fori_loop(0, count, column, carry)
 

@@ -19,9 +19,14 @@ from ..._programs import (
     LARGE,
     shape_of,
 )
-from .block_tridiagonal import Band, coloured_products, column_colours
+from .block_elimination import BlockElimination, BlockFactors
+from .colours import coloured_products, column_colours
 from .dense import AbstractFactors, Inverse, inverse, LU, SMALL
-from .user_solver import AbstractSparseSolver, LineaxFactors, Sparse
+from .user_solver import AbstractSparseSolver, LineaxFactors, Sparse, SuperLU
+
+
+# Unknowns of equations without an order of elimination from which they are sparse.
+_MANY = 256
 
 
 class Dense:
@@ -73,14 +78,14 @@ class Linearisable(eqx.Module):
     It is constructed by `linearisable` at trace time.
 
     - `value`: the function.
-    - `form`: how the Jacobian is stored and solved with: as a dense array, as a narrow
-      band, or as the list of entries that a user's sparse solver receives.
+    - `form`: how the Jacobian is stored and solved with: as a dense array, in blocks, or as
+      the list of entries that a user's sparse solver receives.
     - `regularisation`: numbers that are added to the diagonal of a Jacobian that may be
       singular; else `None`.
     """
 
     value: Callable[[Float[Array, " n"]], Float[Array, " n"]]
-    form: Dense | Band | Sparse
+    form: Dense | BlockElimination | Sparse
     regularisation: Float[Array, " n"] | None
 
     @property
@@ -162,6 +167,8 @@ class Linearisable(eqx.Module):
         def solve_transposed(_: Callable, right: Array) -> Array:
             if isinstance(self.form, Sparse):
                 return self.form.solve_transposed(matrix, right)
+            if isinstance(factors, BlockFactors):
+                return factors.solve_transposed(right)
             # `linear_transpose` has no rule for programs compiled into one function.
             return jax.vjp(factors.solve, right)[1](right)[0]
 
@@ -177,6 +184,7 @@ def linearisable(
     linear_solver: lx.AbstractLinearSolver | AbstractSparseSolver | None = None,
     regularisation: Float[Array, " n"] | None = None,
     *,
+    owners: tuple[int, ...] | None = None,
     rarely: bool = False,
     small: int = SMALL,
 ) -> Linearisable:
@@ -185,7 +193,9 @@ def linearisable(
     By default the size and the sparsity of the Jacobian determine the linear solver. The
     `regularisation` is added to the diagonal of a Jacobian that may be singular. If the
     Jacobian is needed `rarely`, its program is one that compiles quickly. Structure is
-    searched for where there are more unknowns than `small`.
+    searched for where there are more unknowns than `small`. `owners` tells coordinates from
+    multipliers; see `elimination_orders`. Nothing is known of other equations, and large
+    ones are left to SuperLU.
     """
     value = lambda x: fn(x, args)
     if isinstance(linear_solver, lx.AbstractLinearSolver):
@@ -200,8 +210,12 @@ def linearisable(
     pattern = jacobian_pattern(regularised, like) if like.size > small else None
     if pattern is None:
         return Linearisable(value, Dense(None, rarely=rarely), regularisation)
-    band = Band(pattern, rarely)
-    form = band if band.is_cheaper_than_dense() else Dense(None, pattern, rarely)
+    form = Dense(None, pattern, rarely)
+    if owners is not None:
+        blocks = BlockElimination(pattern, np.array(owners), rarely)
+        form = blocks if blocks.is_cheaper_than_dense() else form
+    elif like.size > _MANY:
+        form = Sparse(SuperLU(), pattern, like.size)
     return Linearisable(value, form, regularisation)
 
 

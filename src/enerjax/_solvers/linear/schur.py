@@ -25,7 +25,7 @@ from ..._programs import (
     with_any,
 )
 from .block_diagonal import BlockDiagonal, Symmetric
-from .block_tridiagonal import block_sizes, coloured_products, column_colours
+from .colours import coloured_products, column_colours
 from .graph_elimination import Factors, GraphElimination
 
 
@@ -131,10 +131,39 @@ def _eliminations(
     """
     yield _elimination(np.unique(touched, axis=0, return_inverse=True)[1], coupling)
     order = scipy.sparse.csgraph.reverse_cuthill_mckee(coupling, symmetric_mode=True)
-    sizes = block_sizes(scipy.sparse.csr_array(coupling[order][:, order]))
+    sizes = _block_sizes(scipy.sparse.csr_array(coupling[order][:, order]))
     labels = np.empty(order.size, int)
     labels[order] = np.repeat(np.arange(sizes.size), sizes)
     yield _elimination(labels, coupling)
+
+
+def _block_sizes(pattern: "scipy.sparse.csr_array") -> np.ndarray:
+    """The sizes of blocks that make a symmetric banded matrix block tridiagonal.
+
+    The size of the first block determines the smallest possible sizes of all others.
+    Consecutive blocks are merged while they do not exceed the largest block. Of all sizes
+    of the first block, the one with the least work is chosen.
+    """
+    size, _ = shape_of(pattern)
+    rows, columns = pattern.nonzero()
+    reach = np.arange(size)
+    np.maximum.at(reach, rows, columns)
+    # One more than the last unknown that is coupled to this or an earlier unknown.
+    ends = np.maximum.accumulate(reach) + 1
+    candidates = []
+    for first in range(1, int(ends[:1].max(initial=1)) + 1):
+        sizes, end = [first], first
+        while end < size:
+            end, before = max(int(ends[end - 1]), end + 1), end
+            sizes.append(end - before)
+        width, merged = max(sizes), [0]
+        for each in sizes:
+            if merged[-1] + each <= width:
+                merged[-1] += each
+            else:
+                merged.append(each)
+        candidates.append(np.array(merged))
+    return min(candidates, key=lambda sizes: sizes.size * int(sizes.max()) ** 3)
 
 
 def _elimination(

@@ -15,7 +15,7 @@ import scipy
 from jaxtyping import Array, Float, PyTree
 
 from ..._programs import shape_of
-from .block_tridiagonal import coloured_products, column_colours
+from .colours import coloured_products, column_colours
 from .dense import AbstractFactors
 
 
@@ -81,7 +81,7 @@ class AbstractSparseSolver(eqx.Module):
 
 
 class KLU(AbstractSparseSolver):
-    """Sparse elimination by KLU of SuiteSparse, for Jacobians that are no narrow band.
+    """Sparse elimination by KLU of SuiteSparse, for large Jacobians whose blocks fill.
 
     Examples are grids, nets and frames with many loops: `Newton(linear_solver=ej.KLU())`.
     It runs on CPUs, in float64, and needs the extra `sparse` (the package `klujax`, under
@@ -119,6 +119,38 @@ def _klujax() -> Any:
             "`KLU` needs the package `klujax`: `pip install enerjax[sparse]`."
         ) from error
     return klujax
+
+
+class SuperLU(AbstractSparseSolver):
+    """Sparse elimination by SuperLU of SciPy, with row pivoting, on the host.
+
+    **Reference:** J. W. Demmel et al. (1999), SIAM Journal on Matrix Analysis and
+    Applications 20, page 720.
+    """
+
+    def factorise(
+        self, pattern: SparsePattern, entries: Float[Array, " entries"]
+    ) -> Float[Array, " entries"]:
+        # The factors are not arrays, so loops of JAX cannot carry them.
+        return entries
+
+    def solve(
+        self, pattern: SparsePattern, factors: Any, right: Float[Array, " n"]
+    ) -> Float[Array, " n"]:
+        shape = pattern.size, pattern.size
+
+        def solution(entries: np.ndarray, right: np.ndarray) -> np.ndarray:
+            places = pattern.columns, pattern.row_starts
+            matrix = scipy.sparse.csr_array(
+                (np.asarray(entries, float), *places), shape=shape
+            )
+            try:
+                found = scipy.sparse.linalg.splu(matrix.tocsc())
+            except RuntimeError:  # exactly singular
+                return np.full_like(right, np.nan)
+            return found.solve(np.asarray(right, float)).astype(right.dtype)
+
+        return jax.pure_callback(solution, right, factors, right, vmap_method="sequential")
 
 
 class Sparse:
