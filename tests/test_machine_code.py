@@ -1132,4 +1132,6 @@ def test_results_of_many_lanes_are_computed_in_chunks(monkeypatch):
     xs = jnp.arange(57.0).reshape(19, 3)
     fn = lambda x: (jnp.sin(x), x.sum())
     found = jax.jit(jax.vmap(in_one_function(fn)))(xs)
-    jax.tree.map(np.testing.assert_array_equal, found, jax.jit(jax.vmap(fn))(xs))
+    # Sines of this project and of XLA differ in the last digit.
+    close = functools.partial(np.testing.assert_allclose, rtol=EPS)
+    jax.tree.map(close, found, jax.jit(jax.vmap(fn))(xs))

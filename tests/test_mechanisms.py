@@ -127,8 +127,10 @@ def test_the_squeezer_reaches_the_published_angles():
     solution = run(made("squeezer"), "composed 4", 1e-4, 300)
     k1, k2, k3, k4, k5, k6, k7 = solution.ys.q[-1, 2::3]
     angles = [k1, k2 - k1, k3, k4 - k5, k5, k6 - k7, k7]
-    # Truncation: 6e-7 = C h^4 in the crank, that has turned two and a half times.
-    np.testing.assert_allclose(angles, ANDREWS, rtol=0, atol=1e-6)
+    # Truncation: 1.7e-6 = C h^4 in the crank, that has turned two and a half times. (It is
+    # 2.7e-5 with h = 2e-4 and 1.07e-7 with 5e-5.) The turning of a planar body by twice an
+    # arctangent has a larger C than the turning by its rate.
+    np.testing.assert_allclose(angles, ANDREWS, rtol=0, atol=2e-6)
     assert leak(solution) <= 1e-12
 
 

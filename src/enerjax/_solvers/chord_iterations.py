@@ -96,7 +96,8 @@ def chord_iterations(
         # so a small correction proves nothing there.
         if start.regularisation is None:
             done = done | (is_floor & (size <= powers.small))
-        done = done & jnp.isfinite(size)
+        # One correction alone may leave a light, slow body where it was predicted.
+        done = done & jnp.isfinite(size) & (before.corrections > 0)
         late = before.corrections + 1 >= patience
         return _Chord(
             x=x,
