@@ -127,6 +127,16 @@ def _mechanism(
     return Work(name, scheme, steps, space.mass_centres, (motion,))
 
 
+def _with_springs(name: str, make: Callable[[], space.Mechanism], steps: int) -> Work:
+    """With springs that no step resolves, so that Newton's method takes over.
+
+    An angle vibrates `sqrt(1e6 / J)` times a second, with the inertia `J` of a rod, 0.3.
+    """
+    stiff = lambda: space.with_springs(make(), 1e6)
+    work = _mechanism(name, stiff, steps, Bars())
+    return dataclasses.replace(work, has_gradient=False)
+
+
 def _in_plane(q: Any) -> np.ndarray:
     return np.asarray(q).reshape(-1, 2)
 
@@ -315,6 +325,8 @@ def _works() -> list[Work]:
             )
         ),
         _mechanism("tree-30", lambda: space.tree(30), 500, loops, is_open=True),
+        _with_springs("bodies-16-stiff", lambda: space.chain(16), 500),
+        _with_springs("tree-30-stiff", lambda: space.tree(30), 500),
         _mechanism("four-bar-in-space", space.four_bar, 500, loops),
         _mechanism("two-loops", space.two_loops, 500, loops),
         _mechanism("bricard", space.bricard, 500, loops),

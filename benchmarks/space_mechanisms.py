@@ -160,6 +160,15 @@ def whirling_chain(num_bodies: int, rate: float = 20.0) -> Mechanism:
     return with_rates(chain(num_bodies), (rate * signs).tolist())
 
 
+def with_springs(mechanism: Mechanism, stiffness: float) -> Mechanism:
+    """With torsion springs about all hinges."""
+    joints = [
+        joint if joint.axis is None else dataclasses.replace(joint, stiffness=stiffness)
+        for joint in mechanism.joints
+    ]
+    return dataclasses.replace(mechanism, joints=tuple(joints))
+
+
 def tree(num_bodies: int) -> Mechanism:
     """A binary tree of rods along the axes of space, on hinges."""
     axes, tips, bodies, joints = [0], [X], [_rod(X, 0 * X)], [Joint(GROUND, 0, 0 * X, Y)]

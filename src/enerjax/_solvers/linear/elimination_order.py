@@ -56,9 +56,8 @@ def elimination_orders(
     closed = _closed(pattern)
     groups = _groups(closed, owners)
     sizes = np.bincount(groups).tolist()
-    waits = np.zeros(len(sizes), bool)
-    waits[groups[owners < 0]] = True
-    order = _least_degree(_adjacent(closed, groups), sizes, waits.tolist())
+    awaited = _awaited(closed, owners, groups)
+    order = _least_degree(_adjacent(closed, groups), sizes, awaited)
     for width in _WIDTHS:
         yield Nodes(closed, _merged(order, sizes, width)[groups])
 
@@ -83,6 +82,27 @@ def _groups(closed: "scipy.sparse.csr_array", owners: np.ndarray) -> np.ndarray:
     return np.array(groups)[number]
 
 
+def _awaited(
+    closed: "scipy.sparse.csr_array", owners: np.ndarray, groups: np.ndarray
+) -> list[set[int]]:
+    """For each group, the groups of the coordinates that it waits for.
+
+    A constraint acts on the coordinates that the multiplier of its position touches. The
+    multiplier of its rate touches more, by the velocities that are eliminated.
+    """
+    awaited: list[set[int]] = [set() for _ in range(int(groups.max()) + 1)]
+    fewest: dict[int, set[int]] = {}
+    for k in np.flatnonzero(owners < 0).tolist():
+        near = closed.indices[closed.indptr[k] : closed.indptr[k + 1]]
+        near = set(groups[near[owners[near] >= 0]].tolist())
+        known = fewest.get(int(owners[k]))
+        if known is None or len(near) < len(known):
+            fewest[int(owners[k])] = near
+    for k in np.flatnonzero(owners < 0).tolist():
+        awaited[groups[k]] |= fewest[int(owners[k])]
+    return awaited
+
+
 def _adjacent(closed: "scipy.sparse.csr_array", labels: np.ndarray) -> list[set[int]]:
     """For each label, the labels that it is coupled to."""
     rows, columns = closed.nonzero()
@@ -95,17 +115,17 @@ def _adjacent(closed: "scipy.sparse.csr_array", labels: np.ndarray) -> list[set[
 
 
 def _least_degree(
-    near: Sequence[set[int]], sizes: Sequence[int], waits: Sequence[bool]
+    near: Sequence[set[int]], sizes: Sequence[int], awaited: Sequence[set[int]]
 ) -> list[tuple[int, set[int]]]:
     """The groups in the order of their elimination, with what each is coupled to then.
 
-    Groups that wait do so for those beside them that do not wait.
+    None is eliminated before those that it waits for.
     """
-    pending = [
-        sum(not waits[j] for j in others) if waits[k] else 0
-        for k, others in enumerate(near)
-    ]
-    waiting = [[j for j in others if waits[j]] for others in near]
+    pending = [len(others) for others in awaited]
+    waiting: list[list[int]] = [[] for _ in near]
+    for k, others in enumerate(awaited):
+        for j in others:
+            waiting[j].append(k)
     near = [set(others) for others in near]
     left = set(range(len(near)))
     degree = lambda k: sum(sizes[j] for j in near[k])
@@ -120,10 +140,9 @@ def _least_degree(
         order.append((k, set(near[k])))
         for j in near[k]:
             near[j] = (near[j] | near[k]) - {j, k}
-        if not waits[k]:
-            for j in waiting[k]:
-                pending[j] -= 1
-        for j in near[k]:
+        for j in waiting[k]:
+            pending[j] -= 1
+        for j in near[k].union(waiting[k]):
             if not pending[j]:
                 heapq.heappush(heap, (degree(j), j))
     return order
