@@ -132,7 +132,7 @@ def test_bodies_with_constraints_are_eliminated_in_blocks(name):
     rng = np.random.default_rng(len(name))
     matrix, owners = _with_multipliers(GRAPHS[name], rng)
     size = owners.size
-    elimination = BlockElimination(csr_array(matrix != 0), owners)
+    elimination = BlockElimination(csr_array(matrix != 0), tuple(owners.tolist()))
     assert elimination.width <= 16
     # One product for each pair of neighbours: far below those of a dense matrix.
     assert elimination.changes.shape[0] * elimination.width**3 < 0.03 * size**3
@@ -148,11 +148,35 @@ def test_bodies_with_constraints_are_eliminated_in_blocks(name):
         assert np.max(np.abs(found - exact)) <= bound * np.max(np.abs(exact))
 
 
+def test_relations_stay_with_the_coordinates_that_they_relate():
+    """Without its relation, the inertia of a quaternion at rest is singular."""
+    rng = np.random.default_rng(3)
+    matrix, owners = _with_multipliers(GRAPHS["chain"], rng, own=2, rows=1)
+    size, owners = owners.size, [*owners.tolist(), *range(1000, 1004), None]
+    whole = np.zeros((size + 5, size + 5))
+    whole[:size, :size] = matrix
+    quaternion, relation = np.array([1.0, 0.0, 0.0, 0.0]), size + 4
+    own = slice(size, relation)
+    whole[own, own] = np.diag([0.0, 1.0, 2.0, 3.0])
+    whole[own, relation] = whole[relation, own] = quaternion
+    pattern = whole != 0
+    pattern[own, own] = pattern[own, relation] = pattern[relation, own] = True
+    elimination = BlockElimination(csr_array(pattern), tuple(owners))
+    assert np.unique(elimination.back[size:] // elimination.width).size == 1
+    entries = elimination.evaluate(lambda x: jnp.asarray(whole) @ x, jnp.zeros(size + 5))
+    factors = elimination.empty(size + 5, float).renewed(entries)
+    right = rng.normal(size=size + 5)
+    exact = np.linalg.solve(whole, right)
+    bound = 100 * np.linalg.cond(whole) * EPS  # round-off
+    found = factors.solve(jnp.asarray(right))
+    assert np.max(np.abs(found - exact)) <= bound * np.max(np.abs(exact))
+
+
 def test_blocks_are_eliminated_in_lanes_of_their_own():
     """Each lane exchanges rows as its own numbers require."""
     rng = np.random.default_rng(5)
     matrix, owners = _with_multipliers(GRAPHS["chain"], rng)
-    elimination = BlockElimination(csr_array(matrix != 0), owners)
+    elimination = BlockElimination(csr_array(matrix != 0), tuple(owners.tolist()))
     scales = rng.normal(size=(6, owners.size)) + 3
     right = rng.normal(size=(6, owners.size))
 

@@ -149,7 +149,7 @@ def solve(
         least=prepared.least,
         chord=_chord(scheme) if alone or wait is not None else None,
         by_chord=True if wait is None else wait == 0,
-        owners=owners_of(prepared.guess),
+        owners=owners_of(prepared.guess, model.num_joints),
         rarely=rarely or wait is not None,
     )
     step = scheme, problem, model, start, memory, prepared
@@ -338,17 +338,22 @@ def _with_multipliers(
     return jax.tree.map(change, z, *others, is_leaf=_is_increment)
 
 
-def owners_of(z: PyTree[Any]) -> tuple[int, ...] | None:
+def owners_of(z: PyTree[Any], num_joints: int) -> tuple[int | None, ...] | None:
     """The number of the coordinate that each unknown belongs to, or `-1 - k` for a
-    multiplier of row `k`. `None` if there are other unknowns than those of increments."""
+    multiplier of row `k`. Those of relations between coordinates, the rows behind those of
+    joints, have none: without its relation the inertia of a quaternion is singular, and
+    they go with the coordinates that they relate.
+
+    The whole is `None` if there are other unknowns than those of increments.
+    """
     increments = jax.tree.leaves(z, is_leaf=_is_increment)
     if not all(map(_is_increment, increments)):
         return None
-    owners: list[int] = []
+    owners: list[int | None] = []
     for x in increments:
         size, num_momenta = x.rate.size, x.momentum.size
         first = 0 if num_momenta == size else size
-        owners += (-1 - k for k in range(x.impulse.size))
+        owners += (-1 - k if k < num_joints else None for k in range(x.impulse.size))
         owners += [*range(size), *range(first, first + num_momenta)]
         owners += (-1 - k for k in range(x.velocity_impulse.size))
     return tuple(owners)

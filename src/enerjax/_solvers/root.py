@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, PyTree
 from .._programs import call_traced_once, in_one_function, is_known, part, simplified
 from .._types import Flag, Scalar
 from .linear.dense import AbstractFactors
+from .linear.elimination_order import Owners
 from .linear.jacobian import Linearisable
 from .linear.krylov import jacobian_solver
 from .newton import ChordAlone, Start
@@ -144,7 +145,7 @@ def find_root(
     least: Scalar | float = 1.0,
     chord: Chord | None = None,
     by_chord: Flag | bool = True,
-    owners: tuple[int, ...] | None = None,
+    owners: Owners | None = None,
     rarely: bool = False,
 ) -> Root:
     """A root of `fn(y, args)`. Failures are reported in the `Root`, not raised.

@@ -128,7 +128,7 @@ def _explained(
             (scheme.stage, problem),
             root_finder.linear_solver,
             redundant,
-            owners=owners_of(z),
+            owners=owners_of(z, model.num_joints),
             small=0 if by_chord else SMALL,
         ).form
         jacobian = form.description(flat.size)

@@ -322,7 +322,8 @@ class _Body:
             eqn = None if isinstance(after, Literal) else updates.get(after)
             if eqn is None or eqn.invars[0] is not before:
                 continue
-            if sum(x is after for x in read) == 1 and eqn.invars[1].aval.size:
+            is_array = bool(before.aval.shape) and eqn.invars[1].aval.size > 0
+            if is_array and sum(x is after for x in read) == 1:
                 self.changes[k] = eqn
         for k, eqn in self.changes.items():
             outs[k] = eqn.invars[1]

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from ..._programs import in_one_function, shape_of
 from .colours import coloured_products, column_colours
 from .dense import AbstractFactors, eliminated, SMALL, UNROLLED
-from .elimination_order import elimination_orders, Nodes
+from .elimination_order import elimination_orders, known_owners, Nodes, Owners
 
 
 # What happens to a block in a change: it is inverted, or replaced by the product of two
@@ -33,7 +33,7 @@ _INVERT, _MULTIPLY, _ADD = range(3)
 class BlockElimination:
     """The index tables by which a sparse matrix is stored in blocks and eliminated.
 
-    The tables are constructed at trace time, with the `owners` of `elimination_orders`.
+    The tables are constructed at trace time. See `Owners` for `owners`.
     Blocks are padded with decoupled unknowns, whose equation is `x = 0`.
 
     - `colours`: the colour of each column. Columns of equal colour share no row.
@@ -50,13 +50,14 @@ class BlockElimination:
     """
 
     def __init__(
-        self, pattern: "scipy.sparse.csr_array", owners: np.ndarray, rarely: bool = False
+        self, pattern: "scipy.sparse.csr_array", owners: Owners, rarely: bool = False
     ):
         self._rarely = rarely
         self.size, _ = shape_of(pattern)
-        nodes = min(elimination_orders(pattern, owners), key=_cost)
+        known = known_owners(pattern, owners)
+        nodes = min(elimination_orders(pattern, known), key=_cost)
         self.cost, self.width = _cost(nodes), nodes.width
-        self.colours = _colours_by_kind(pattern, np.asarray(owners) < 0)
+        self.colours = _colours_by_kind(pattern, known < 0)
         self.num_colours = int(self.colours.max(initial=0)) + 1
         self._place_unknowns(nodes)
         numbers = self._number_blocks(nodes)

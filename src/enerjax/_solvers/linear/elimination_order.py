@@ -14,8 +14,15 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 import scipy
+from jaxtyping import Int
+from typing_extensions import TypeAliasType
 
 from ..._programs import shape_of
+
+
+# A number for each unknown: not negative for coordinates, negative for multipliers, and
+# `None` for multipliers of relations between coordinates.
+Owners = TypeAliasType("Owners", tuple[int | None, ...])
 
 
 # Numbers of unknowns up to which nodes are merged; the one with the least work is chosen.
@@ -46,12 +53,11 @@ class Nodes:
 
 
 def elimination_orders(
-    pattern: "scipy.sparse.csr_array", owners: np.ndarray
+    pattern: "scipy.sparse.csr_array", owners: Int[np.ndarray, " n"]
 ) -> Iterator[Nodes]:
     """Divisions of the unknowns into nodes, which differ in the size of the nodes.
 
-    `owners` are numbers, one for each unknown: not negative for coordinates, and negative
-    for multipliers.
+    `owners` are those of `known_owners`.
     """
     closed = _closed(pattern)
     groups = _groups(closed, owners)
@@ -60,6 +66,24 @@ def elimination_orders(
     order = _least_degree(_adjacent(closed, groups), sizes, awaited)
     for width in _WIDTHS:
         yield Nodes(closed, _merged(order, sizes, width)[groups])
+
+
+def known_owners(
+    pattern: "scipy.sparse.csr_array", owners: Owners
+) -> Int[np.ndarray, " n"]:
+    """A number for each unknown: not negative for coordinates, negative for multipliers.
+
+    Coordinates with a relation, and its multiplier, have one owner.
+    """
+    unknown = np.iinfo(int).min
+    known = np.array([unknown if owner is None else owner for owner in owners])
+    closed = _closed(pattern)
+    for k in np.flatnonzero(known == unknown):
+        near = known[closed.indices[closed.indptr[k] : closed.indptr[k + 1]]]
+        related = np.unique(near[near >= 0])
+        known[np.isin(known, related)] = related[0]
+        known[k] = related[0]
+    return known
 
 
 def _closed(pattern: "scipy.sparse.csr_array") -> "scipy.sparse.csr_array":

@@ -22,6 +22,7 @@ from ..._programs import (
 from .block_elimination import BlockElimination, BlockFactors
 from .colours import coloured_products, column_colours
 from .dense import AbstractFactors, Inverse, inverse, LU, SMALL
+from .elimination_order import Owners
 from .user_solver import AbstractSparseSolver, LineaxFactors, Sparse, SuperLU
 
 
@@ -184,7 +185,7 @@ def linearisable(
     linear_solver: lx.AbstractLinearSolver | AbstractSparseSolver | None = None,
     regularisation: Float[Array, " n"] | None = None,
     *,
-    owners: tuple[int, ...] | None = None,
+    owners: Owners | None = None,
     rarely: bool = False,
     small: int = SMALL,
 ) -> Linearisable:
@@ -194,7 +195,7 @@ def linearisable(
     `regularisation` is added to the diagonal of a Jacobian that may be singular. If the
     Jacobian is needed `rarely`, its program is one that compiles quickly. Structure is
     searched for where there are more unknowns than `small`. `owners` tells coordinates from
-    multipliers; see `elimination_orders`. Nothing is known of other equations, and large
+    multipliers; see `Owners`. Nothing is known of other equations, and large
     ones are left to SuperLU.
     """
     value = lambda x: fn(x, args)
@@ -212,7 +213,7 @@ def linearisable(
         return Linearisable(value, Dense(None, rarely=rarely), regularisation)
     form = Dense(None, pattern, rarely)
     if owners is not None:
-        blocks = BlockElimination(pattern, np.array(owners), rarely)
+        blocks = BlockElimination(pattern, owners, rarely)
         form = blocks if blocks.is_cheaper_than_dense() else form
     elif like.size > _MANY:
         form = Sparse(SuperLU(), pattern, like.size)
