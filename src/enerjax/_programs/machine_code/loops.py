@@ -281,8 +281,8 @@ class _Slice(NamedTuple):
     def offset(
         self, evaluation: "Evaluation", places: np.ndarray
     ) -> tuple[Node | None, np.ndarray]:
-        """How far the slice lies behind the first one of the array, whose cells are given,
-        and the cells of that."""
+        """The distance of the slice from the first slice of the array, and the cells of the
+        first slice. The cells of the array are `places`."""
         graph, shape, offset = evaluation.graph, self.value.shape, 0
         strides = strides_of(places)
         assert strides is not None

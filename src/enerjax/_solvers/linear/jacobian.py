@@ -26,7 +26,7 @@ from .elimination_order import Owners
 from .user_solver import AbstractSparseSolver, LineaxFactors, Sparse, SuperLU
 
 
-# Unknowns of equations without an order of elimination from which they are sparse.
+# Equations with more unknowns than this and without `owners` are left to SuperLU.
 _MANY = 256
 
 
@@ -195,8 +195,7 @@ def linearisable(
     `regularisation` is added to the diagonal of a Jacobian that may be singular. If the
     Jacobian is needed `rarely`, its program is one that compiles quickly. Structure is
     searched for where there are more unknowns than `small`. `owners` tells coordinates from
-    multipliers; see `Owners`. Nothing is known of other equations, and large
-    ones are left to SuperLU.
+    multipliers; without it, SuperLU solves large equations.
     """
     value = lambda x: fn(x, args)
     if isinstance(linear_solver, lx.AbstractLinearSolver):

@@ -80,7 +80,19 @@ class AbstractSparseSolver(eqx.Module):
         """
 
 
-class KLU(AbstractSparseSolver):
+class AbstractWithoutFactors(AbstractSparseSolver):
+    """A solver that factorises the matrix for every solution.
+
+    Its factors are not arrays, so loops of JAX cannot carry them.
+    """
+
+    def factorise(
+        self, pattern: SparsePattern, entries: Float[Array, " entries"]
+    ) -> Float[Array, " entries"]:
+        return entries
+
+
+class KLU(AbstractWithoutFactors):
     """Sparse elimination by KLU of SuiteSparse, for large Jacobians whose blocks fill.
 
     Examples are grids, nets and frames with many loops: `Newton(linear_solver=ej.KLU())`.
@@ -97,12 +109,6 @@ class KLU(AbstractSparseSolver):
 
     def __check_init__(self):
         _klujax()
-
-    def factorise(
-        self, pattern: SparsePattern, entries: Float[Array, " entries"]
-    ) -> Float[Array, " entries"]:
-        # The factors of KLU are not arrays, so loops of JAX cannot carry them.
-        return entries
 
     def solve(
         self, pattern: SparsePattern, factors: Any, right: Float[Array, " n"]
@@ -121,18 +127,12 @@ def _klujax() -> Any:
     return klujax
 
 
-class SuperLU(AbstractSparseSolver):
+class SuperLU(AbstractWithoutFactors):
     """Sparse elimination by SuperLU of SciPy, with row pivoting, on the host.
 
     **Reference:** J. W. Demmel et al. (1999), SIAM Journal on Matrix Analysis and
     Applications 20, page 720.
     """
-
-    def factorise(
-        self, pattern: SparsePattern, entries: Float[Array, " entries"]
-    ) -> Float[Array, " entries"]:
-        # The factors are not arrays, so loops of JAX cannot carry them.
-        return entries
 
     def solve(
         self, pattern: SparsePattern, factors: Any, right: Float[Array, " n"]
