@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import pytest
+import space_mechanisms as space
 from jax.flatten_util import ravel_pytree
 
 import enerjax as ej
@@ -127,7 +128,7 @@ def test_the_matrix_of_the_multipliers_is_that_of_dense_algebra(graph, coupled):
 
     @jax.jit
     def found(at, u, x):
-        of_rows = schur(tables, rows, at, symmetric)
+        of_rows = schur(tables, tables.products(rows, at), symmetric)
         products = of_rows.product(u), of_rows.transposed(x[0]), of_rows.solve(x)
         return *products, jax.jacfwd(rows)(at)
 
@@ -159,7 +160,7 @@ def test_the_matrix_of_redundant_rows_is_that_of_the_pseudo_inverse(copies):
 
     @jax.jit
     def found(at, x):
-        of_rows = schur(tables, rows, at, weight, added)
+        of_rows = schur(tables, tables.products(rows, at), weight, added)
         delassus = DelassusMatrix(weight, of_rows, None, added)
         return delassus.solve(x[None])[0], delassus.effective(x)
 
@@ -191,11 +192,14 @@ CHORDS = {
 }
 
 
-def _left_by_one_correction(scheme, system, start, rng):
+STEP = 0.1
+
+
+def _left_by_one_correction(scheme, system, start, rng, args=None):
     """The sizes of a residual before and after one correction of the chord method."""
-    model = make_model(system, start, None)
+    model = make_model(system, start, args)
     start = model.to_internal(start)
-    problem = scheme.problem(model, start, jnp.asarray(0.1))
+    problem = scheme.problem(model, start, jnp.asarray(STEP))
     num_constraints = model.scales.constraint.size
     z = scheme.predict(problem, jnp.zeros(start.v.size), jnp.zeros(num_constraints))
     flat, unravel = ravel_pytree(z)
@@ -241,6 +245,54 @@ def test_without_stiffness_one_correction_solves_the_step(name, size):
     before, left = _left_by_one_correction(CHORDS[name], system, start, rng)
     assert before > 0.1
     assert left <= 1e4 * EPS  # round-off
+
+
+def _matrices(k, args):
+    """Stiffness matrices of elements: positive definite, of rank one, and zero."""
+    root = jnp.stack([jnp.eye(2) + 0.5, jnp.ones((2, 2)), jnp.zeros((2, 2))])[k % 3]
+    return args * root @ root.T
+
+
+STIFF = {
+    # Strains of elements with a matrix, springs, and squares in a plain function.
+    "matrices": ej.Elements.from_strains(
+        lambda x, k, args: jnp.stack([x[1] - x[0], x[0] + 2 * x[1]]),
+        _matrices,
+        [[0, 1], [4, 5], [6, 7], [3, 8], [1, 2]],
+    ),
+    "springs": ej.Elements.from_strains(
+        lambda x, k, args: x[1] - x[0], lambda k, args: args, [[0, 1], [4, 5], [3, 8]]
+    ),
+    "plain": lambda q, args: (
+        0.5 * args * (q[1] - q[0] - 1) ** 2 + args * jnp.sum((q[4:6] - q[7:9]) ** 2)
+    ),
+}
+
+
+@pytest.mark.parametrize("formulation", ["ggl", "index3"])
+@pytest.mark.parametrize("redundant", [False, True])
+@pytest.mark.parametrize("potential", STIFF)
+@pytest.mark.slow_for(
+    "plain-True-ggl", "springs-False-index3", "springs-True-index3", "plain-True-index3"
+)
+def test_linear_strains_take_one_correction_too(potential, redundant, formulation):
+    """However stiff they are: here 30 to 1000 radians a step."""
+    rng = np.random.default_rng(0)
+    rows = jnp.asarray(rng.normal(size=(3, 4)))
+    system = ej.System(
+        jnp.diag(jnp.asarray(rng.uniform(0.5, 2, size=12))),
+        STIFF[potential],
+        lambda q, args: jnp.sum(rows * q.reshape(3, 4), axis=1),
+        redundant=redundant,
+    )
+    start = ej.State(*jnp.asarray(rng.normal(size=(2, 12))))
+    scheme = ej.EnergyPreserving(formulation)
+    for stiffness in (1e5, 1e8):
+        before, left = _left_by_one_correction(scheme, system, start, rng, stiffness)
+        # Round-off, by the condition of the stiffness beside the inertia; truncation of
+        # what makes redundant rows regular.
+        condition = STEP**2 * stiffness
+        assert left <= (1e-5 if redundant else 100 * EPS * condition) * before
 
 
 WITH_MOMENTA = [x for x in CHORDS if x not in ("consistent", "momentum")]
@@ -413,10 +465,11 @@ def test_the_motion_is_that_of_newton_alone(name):
 
 
 def test_newton_follows_where_springs_are_too_stiff_for_the_chord():
-    """Two points on rods, held by springs of a hundred radians a step."""
+    """Two points on rods, held by nonlinear springs of a hundred radians a step."""
+    soft = lambda x: x * jnp.tanh(x)
     system = ej.System(
         jnp.eye(4),
-        lambda q, args: 0.5 * args * (q[1] ** 2 + (q[3] - q[1]) ** 2),
+        lambda q, args: 0.5 * args * (soft(q[1]) + soft(q[3] - q[1])),
         lambda q, args: jnp.array([q[:2] @ q[:2] - 1, jnp.sum((q[2:] - q[:2]) ** 2) - 1]),
     )
     stiffness = (100 / 0.01) ** 2
@@ -492,13 +545,13 @@ def test_what_is_round_off_grows_with_the_system(searched_by):
 @pytest.mark.parametrize("damped", long([False, True], True))
 @pytest.mark.slow
 def test_stiff_forces_are_noticed_before_the_first_program(searched_by, damped):
-    """A row of points on springs, or in dampers, of ten radians a step."""
+    """A row of points on nonlinear springs, or in dampers, of ten radians a step."""
     size, h, strength = 12, 0.01, 1e3
     stiffness = 0.0 if damped else strength**2
     force = lambda q, v, t, args: -args["c"] * v
     system = ej.System(
         jnp.eye(2 * size),
-        lambda q, args: 0.5 * args["k"] * jnp.sum(q[1::2] ** 2) + 9.81 * jnp.sum(q[::2]),
+        lambda q, args: 9.81 * jnp.sum(q[::2]) - args["k"] * jnp.sum(jnp.cos(q[1::2])),
         lambda q, args: q[::2] - 0.1 * q[1::2] ** 2,
         force=force if damped else None,
     )
@@ -506,6 +559,41 @@ def test_stiff_forces_are_noticed_before_the_first_program(searched_by, damped):
     start = ej.initial_state(system, jnp.zeros(2 * size), jnp.ones(2 * size), args)
     ej.simulate(system, ej.EnergyPreserving(), start, args, h=h, num_steps=3)
     assert searched_by == ["Newton"]
+
+
+def test_springs_do_not_need_newton_however_stiff_they_are(searched_by):
+    """A spatial chain with springs of a thousand radians a step in its hinges."""
+    mechanism = space.with_springs(space.chain(3), 1e8)
+    system, start, args = mechanism.scene().build()
+    run = lambda finder: ej.simulate(
+        system, ej.EnergyPreserving(), start, args, h=0.01, num_steps=20, root_finder=finder
+    )
+    sol = run(Newton())
+    assert searched_by == ["ChordAlone"]
+    by_newton = run(Newton(linear_solver=lx.LU()))
+    # Solver: round-off of the forces of the springs over 20 steps.
+    np.testing.assert_allclose(sol.ys.q, by_newton.ys.q, rtol=0, atol=1e-11)
+    assert jnp.max(jnp.abs(sol.audit.leak)) <= 1e3 * EPS
+    assert "3 of the rows are those of strains" in str(
+        ej.explain(system, ej.EnergyPreserving(), start, args)
+    )
+
+
+def test_the_stiffness_of_a_net_is_left_to_newton():
+    """Its elimination would take many rounds."""
+    size = 8
+    net = np.arange(size**2).reshape(size, size)
+    ends = np.concatenate([
+        np.stack([net[:, :-1].ravel(), net[:, 1:].ravel()], axis=1),
+        np.stack([net[:-1].ravel(), net[1:].ravel()], axis=1),
+    ])  # fmt: skip
+    springs = lambda q, args: jnp.sum((q[ends[:, 0]] - q[ends[:, 1]]) ** 2)
+    held = lambda q, args: q[:2]
+    system = ej.System(jnp.eye(2 * size**2), springs, held)
+    start = ej.State(jnp.zeros(2 * size**2), jnp.zeros(2 * size**2))
+    model = make_model(system, start, None)
+    assert model.has_delassus_matrix
+    assert model.elastic_tables is None
 
 
 @pytest.mark.parametrize(

@@ -267,11 +267,16 @@ class AbstractModel(eqx.Module):
         """
 
     @abc.abstractmethod
-    def delassus_matrix(self, state: State) -> DelassusMatrix:
-        """`B M^-1 B^T` at a state. It exists only if `has_delassus_matrix`."""
+    def delassus_matrix(self, state: State, h: Scalar | None = None) -> DelassusMatrix:
+        """`B M^-1 B^T` at a state. It exists only if `has_delassus_matrix`.
+
+        With the length `h` of a step it includes the stiffness of strains, if any.
+        """
 
     @abc.abstractmethod
-    def neglected_by_chord(self, state: State, v: Velocities, h: Scalar) -> Velocities:
+    def neglected_by_chord(
+        self, state: State, v: Velocities, h: Scalar, *, elastic: bool
+    ) -> Velocities:
         """The velocities that stiffness, damping and the change of the inertia cause in a
         step with the velocities `v`: the chord method neglects them."""
 

@@ -283,7 +283,9 @@ class CanonicalModel(AbstractModel):
         _, (force, rate, power) = jax.jvp(gradient, at, (rate / h, -force / h, no_time))
         return Gradient(force, rate / h, power)
 
-    def neglected_by_chord(self, state: State, v: Velocities, h: Scalar) -> Velocities:
+    def neglected_by_chord(
+        self, state: State, v: Velocities, h: Scalar, *, elastic: bool
+    ) -> Velocities:
         moved, force = 0.5 * h * v, self.metric(state) @ v
         rows = lambda q, p: (self.slope(State(q, p, state.t)), self.lift(q, p))
         slope, rate = jax.jvp(rows, (state.q, state.v), (moved, force))[1]
@@ -295,13 +297,14 @@ class CanonicalModel(AbstractModel):
     def has_delassus_matrix(self) -> bool:
         return self.scales.constraint.size == 0 or self.constraint_tables is not None
 
-    def delassus_matrix(self, state: State) -> DelassusMatrix:
+    def delassus_matrix(self, state: State, h: Scalar | None = None) -> DelassusMatrix:
         weight = self.system.inverse_inertia(state.q, state.v, self.args)
         if self.constraint_tables is None:
             return DelassusMatrix(weight, None, None)
         rest = jnp.zeros_like(state.q)
         added, rates = self.delassus_regularisation, self._rates_of_joints(state)
-        rows = schur(self.constraint_tables, rates, rest, weight, added)
+        products = self.constraint_tables.products(rates, rest)
+        rows = schur(self.constraint_tables, products, weight, added)
         return DelassusMatrix(weight, rows, None, added)
 
     def _tables(self, state: State) -> SchurTables | None:

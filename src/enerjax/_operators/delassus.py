@@ -37,12 +37,15 @@ class DelassusMatrix(eqx.Module):
     - `frames`: the map to the rates of redundant coordinates; `None` if there are none.
     - `regularisation`: the diagonal matrix `E` that has been added to `G` before it was
       factorised, where joints may be redundant; else `None`.
+    - `elastic`: the same as `schur` with the rows of strains behind those of the joints;
+      see `elastic.py`. `None` where stiffness is left out.
     """
 
     inverse_inertia: Symmetric
     schur: Schur | None
     frames: Frames | None
     regularisation: JointMultipliers | None = None
+    elastic: Schur | None = None
 
     def product(self, velocity: Velocities) -> Multipliers:
         """`C velocity`, the rates of change of the joints."""
@@ -69,12 +72,33 @@ class DelassusMatrix(eqx.Module):
         the inverse in the range of `G`, and zero in its null space: `(G + E)^-1` would
         divide round-off there by a small number.
         """
-        if self.schur is None:
-            return right
-        found = self.schur.solve(right)
-        if self.regularisation is None:
+        return right if self.schur is None else self._solve(self.schur, right)
+
+    def _solve(self, schur: Schur, right: Float[Array, "k n"]) -> Float[Array, "k n"]:
+        found, added = schur.solve(right), self.regularisation
+        if added is None:
             return found
-        return found - self.schur.solve(self.regularisation[None] * found)
+        added = jnp.pad(added, (0, right.shape[1] - added.size))
+        return found - schur.solve(added[None] * found)
+
+    def motion(
+        self, free: Velocities, rates: JointMultipliers, *others: JointMultipliers
+    ) -> tuple[JointMultipliers, Velocities, tuple[JointMultipliers, ...]]:
+        """The solutions `x` and `u` of
+
+            (M + S^T S) u + C^T x = M free,   C u = rates
+
+        where `S` are the rows of the strains, and `G^-1` times each of the `others`.
+        """
+        if self.elastic is None:
+            impulse, *found = self.solve(jnp.stack([self.product(free) - rates, *others]))
+            return impulse, free - self.velocity(impulse), tuple(found)
+        found = self.solve(jnp.stack(others)) if others else ()
+        right = self.elastic.product(free)
+        right = right.at[: rates.size].add(-rates)
+        both = self._solve(self.elastic, right[None])[0]
+        velocity = free - self.inverse_inertia @ self.elastic.transposed(both)
+        return both[: rates.size], velocity, tuple(found)
 
     def effective(self, multipliers: Multipliers) -> Multipliers:
         """Multipliers of the joints without their part in the null space of `G`.

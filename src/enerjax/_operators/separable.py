@@ -59,6 +59,7 @@ from .._types import (
 from .action import action_of, gradient_in_rows
 from .base import AbstractModel, Position, Reaction
 from .delassus import DelassusMatrix
+from .elastic import elastic_rates, elastic_tables, elasticity, ElasticTables
 from .elements import (
     element_energies,
     gradient_and_work_by_rows,
@@ -86,6 +87,8 @@ class SeparableModel(AbstractModel):
     kinematics: AbstractKinematics
     # The index tables of `delassus_matrix`; `None` where there is none.
     constraint_tables: SchurTables | None = eqx.field(static=True)
+    # The same with the rows of strains; `None` if the chord method leaves them out.
+    elastic_tables: ElasticTables | None = eqx.field(static=True)
     # The model with the velocities of the user, if those of this one are others.
     without_rotations: "SeparableModel | None"
 
@@ -113,6 +116,7 @@ class SeparableModel(AbstractModel):
         self.inverse_inertia = inverse_of(self.inertia)
         self.scales = self._scales(state)
         self.constraint_tables = self._constraint_tables(state)
+        self.elastic_tables = self._elastic_tables(state)
 
     @property
     def has_own_momenta(self) -> bool:
@@ -196,7 +200,9 @@ class SeparableModel(AbstractModel):
             return slope
         return slope - self.pull(q, q, self.force(q, state.v, state.t))
 
-    def neglected_by_chord(self, state: State, v: Velocities, h: Scalar) -> Velocities:
+    def neglected_by_chord(
+        self, state: State, v: Velocities, h: Scalar, *, elastic: bool
+    ) -> Velocities:
         def acceleration(q: Coordinates, v: Velocities) -> Velocities:
             rows = self.slope(State(q, v, state.t))
             is_rotated = self.without_rotations is not None
@@ -204,7 +210,12 @@ class SeparableModel(AbstractModel):
             return self.inverse_inertia @ force
 
         moved = 0.5 * h * self.lift(state.q, v)
-        return 0.5 * h * jax.jvp(acceleration, (state.q, state.v), (moved, v))[1]
+        change = 0.5 * h * jax.jvp(acceleration, (state.q, state.v), (moved, v))[1]
+        if not elastic or self.elastic_tables is None:
+            return change
+        # Up to geometric stiffness the strains of springs cause all of it.
+        of_strains, transpose = jax.vjp(self._rates_of_strains(state.q, h), v)
+        return change - self.inverse_inertia @ transpose(of_strains)[0]
 
     def velocity(self, state: State) -> Velocities:
         return state.v
@@ -434,14 +445,50 @@ class SeparableModel(AbstractModel):
     def has_delassus_matrix(self) -> bool:
         return self.constraint_tables is not None
 
-    def delassus_matrix(self, state: State) -> DelassusMatrix:
-        assert self.constraint_tables is not None
-        frames = self._frames(state.q)
-        rates, weight = self._rates_of_joints(state.q, state.t, frames), self._weight()
-        rest = jnp.zeros((weight.shape[0],), state.q.dtype)
-        added = self.delassus_regularisation
-        rows = schur(self.constraint_tables, rates, rest, weight, added)
+    def delassus_matrix(self, state: State, h: Scalar | None = None) -> DelassusMatrix:
+        tables, q = self.constraint_tables, state.q
+        assert tables is not None
+        weight, added = self._weight(), self.delassus_regularisation
+        rest = jnp.zeros((weight.shape[0],), q.dtype)
+        if h is not None and self.elastic_tables is not None:
+            rates = self._rates_with_strains(state, h)
+            both = self.elastic_tables.schurs(rates, rest, weight, added)
+            return DelassusMatrix(self.inverse_inertia, both[0], None, added, both[1])
+        frames = self._frames(q)
+        products = tables.products(self._rates_of_joints(q, state.t, frames), rest)
+        rows = schur(tables, products, weight, added)
         return DelassusMatrix(self.inverse_inertia, rows, frames, added)
+
+    def _rates_with_strains(
+        self, state: State, h: Scalar
+    ) -> Callable[[Velocities], Float[Array, " rows"]]:
+        """The rates of the joints, followed by the rows of the strains."""
+        joints = self._rates_of_joints(state.q, state.t, None)
+        strains = self._rates_of_strains(state.q, h)
+        return lambda v: jnp.concatenate([joints(v), strains(v)])
+
+    def _rates_of_strains(
+        self, q: Coordinates, h: Scalar
+    ) -> Callable[[Velocities], Float[Array, " rows"]]:
+        strains = elasticity(self.system.potential, q, self.args)
+        return elastic_rates(strains, q, h, lambda v: self.lift(q, v))
+
+    def _elastic_tables(self, state: State) -> ElasticTables | None:
+        """The tables of joints and strains together.
+
+        `None` where there are no strains, where coordinates are redundant, and where there
+        are more strains than velocities: the exact Jacobian is smaller then.
+        """
+        q, rest = state.q, jnp.zeros_like(self.inertia.diagonal())
+        if self.constraint_tables is None or self._frames(q) is not None:
+            return None
+        strains = elasticity(self.system.potential, q, self.args)
+        if not 0 < strains.num_strains <= rest.size:
+            return None
+        t = jnp.zeros((), rest.dtype) if self.system.is_timed else None
+        rates = self._rates_with_strains(State(q, rest, t), jnp.ones((), rest.dtype))
+        num_joints = self.constraint_tables.num_rows
+        return elastic_tables(rates, num_joints, rest, self.inverse_inertia)
 
     def _frames(self, q: Coordinates) -> Frames | None:
         """`L` stacked on `B_c`, where coordinates are redundant."""

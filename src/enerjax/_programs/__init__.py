@@ -44,3 +44,4 @@ from .sparsity.pattern import (
     LARGE as LARGE,
     shape_of as shape_of,
 )
+from .squares import Squares as Squares, squares_in as squares_in

@@ -161,6 +161,11 @@ def has_chord(scheme: AbstractOneSolveScheme, model: AbstractModel) -> bool:
     return isinstance(scheme, AbstractSchemeWithChord) and model.has_delassus_matrix
 
 
+def has_elastic_chord(scheme: AbstractOneSolveScheme) -> bool:
+    """Whether the chord method includes the stiffness of strains."""
+    return isinstance(scheme, AbstractSchemeWithChord) and scheme.has_elastic_chord
+
+
 def is_chord_alone(
     root_finder: RootFinder | ChordAlone,
     scheme: AbstractOneSolveScheme,

@@ -22,6 +22,7 @@ from .._system import closes_over_traced_values, System
 from .._types import Scalar
 from .experience import Experience
 from .loop import dispensable_newton
+from .stage import has_elastic_chord
 from .step import model_for
 from .task import Task
 
@@ -78,8 +79,9 @@ def _contraction(task: Task) -> Scalar:
     """An estimate, at the start, of the contraction of the chord method by stiff forces.
 
     With constant inertia it is the spectral radius of `h^2/4 M^-1 K + h/2 M^-1 D`, with the
-    stiffness and damping of the forces, by power iteration.
+    stiffness and damping of the forces that its matrix omits, by power iteration.
     """
+    elastic = has_elastic_chord(task.scheme.stage)
     model = model_for(task.scheme, task.system, task.start, task.args)
     start, h = model.to_internal(task.start), task.plan.unit
     is_separable = isinstance(model, SeparableModel)
@@ -87,7 +89,7 @@ def _contraction(task: Task) -> Scalar:
     size = lambda v: jnp.sqrt(v @ inertia @ v)
 
     def after(v: jax.Array, _: None) -> tuple[jax.Array, Scalar]:
-        change = model.neglected_by_chord(start, v, h)
+        change = model.neglected_by_chord(start, v, h, elastic=elastic)
         return change / jnp.maximum(size(change), jnp.finfo(h.dtype).tiny), size(change)
 
     v = jnp.cos(jnp.arange(1.0, start.v.size + 1)).astype(h.dtype)

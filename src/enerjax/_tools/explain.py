@@ -10,7 +10,13 @@ from .._operators import AbstractModel, Increment, SeparableModel
 from .._programs import num_operations, simplified, why_not_one_function
 from .._run.inputs import prepare
 from .._run.loop import dispensable_newton, Stepper
-from .._run.stage import free_flight, is_chord_alone, owners_of, step_problem
+from .._run.stage import (
+    free_flight,
+    has_elastic_chord,
+    is_chord_alone,
+    owners_of,
+    step_problem,
+)
 from .._run.step import model_for
 from .._run.step_sizes import End, EqualSteps
 from .._solvers import ChordAlone, flattened, linearisable, Newton, RootFinder, SMALL
@@ -29,8 +35,9 @@ class Explanation:
     - `method`: how they are searched for. Beside a chord method programs have Newton's
       method from the beginning where forces are stiff, with events, with a
       `StepController`, and inside of `jit` and other transformations.
-    - `chord`: how the matrix `B M^-1 B^T` of the constraints is eliminated; `None` where
-      the chord method is not used, or there are no constraints.
+    - `chord`: how the matrix `B M^-1 B^T` of the constraints, and of strains where their
+      stiffness is included, is eliminated; `None` where the chord method is not used, or
+      there are no constraints.
     - `jacobian`: how the exact Jacobian is stored and eliminated.
     - `obstacles`: the operations that keep a step from being one function of machine code,
       with the places where they are called; empty if it is one function.
@@ -138,7 +145,7 @@ def _explained(
         solves=len(scheme.stages),
         unknowns=_unknowns(z),
         method=_BY_CHORD.format(newton) if by_chord else newton,
-        chord=_chord(model) if by_chord else None,
+        chord=_chord(scheme, model) if by_chord else None,
         jacobian=jacobian,
         obstacles=why_not_one_function(step, begin),
         operations=num_operations(
@@ -162,7 +169,10 @@ def _coordinates(model: AbstractModel, start: State) -> str:
     return model.kinematics.describe(start.q, start.v)
 
 
-def _chord(model: AbstractModel) -> str | None:
+def _chord(scheme: AbstractScheme, model: AbstractModel) -> str | None:
+    elastic = has_elastic_chord(scheme.stage)
+    if elastic and isinstance(model, SeparableModel) and model.elastic_tables is not None:
+        return model.elastic_tables.description
     tables = model.constraint_tables
     return None if tables is None else tables.description
 

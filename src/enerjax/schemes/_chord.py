@@ -1,9 +1,10 @@
 """The corrections of the chord method, in closed form.
 
-The approximate Jacobian contains the inertia and the constraint gradients `C`, and omits
-all terms of the stiffness. The right-hand sides are the rows of the balance of momentum
-`r_m`, the constraints divided by `h`, `r_phi`, and their rates `r_psi`. After block
-elimination each kind of multiplier has a linear system with the matrix `G = C M^-1 C^T`.
+The approximate Jacobian contains the inertia and the constraint gradients `C`, and in
+`step_chord` the stiffness `K` of strains; all other terms of the stiffness are omitted. The
+right-hand sides are the rows of the balance of momentum `r_m`, the constraints divided by
+`h`, `r_phi`, and their rates `r_psi`. After block elimination each kind of multiplier has a
+linear system with the matrix `G = C M^-1 C^T`.
 Coordinate constraints are taken out first, and their multipliers follow from the normal
 components of the balance of momentum. Where momenta are unknowns, they are taken out too.
 """
@@ -19,7 +20,7 @@ from ._discontinuous import JumpAndEnd
 def step_chord(rows: Increment, delassus: DelassusMatrix) -> Increment:
     """The correction of a step with `v1 = 2 (rate - M^-1 C^T eta) - v0`; it solves
 
-    2 M rate + C^T (impulse - 2 eta) = r_m
+    2 (M + h^2/4 K) rate + C^T (impulse - 2 eta) = r_m
     C rate = r_phi,   2 C rate - 2 G eta = r_psi
     """
     if rows.momentum.size > 0:
@@ -28,20 +29,19 @@ def step_chord(rows: Increment, delassus: DelassusMatrix) -> Increment:
         return _with_momenta(found, rows, momentum)
     reduced = delassus.reduced(rows)
     inner = reduced.rows
-    free = delassus.inverse_inertia @ inner.rate
-    impulse = 0.5 * delassus.product(free) - inner.impulse
+    free = 0.5 * (delassus.inverse_inertia @ inner.rate)
     if inner.velocity_impulse.size == 0:
-        (impulse,) = delassus.solve(impulse[None])
+        impulse, rate, _ = delassus.motion(free, inner.impulse)
         reaction = inner.velocity_impulse
         both = impulse
     else:
-        right = jnp.stack([impulse, inner.impulse - 0.5 * inner.velocity_impulse])
-        impulse, reaction = delassus.solve(right)
+        slip = inner.impulse - 0.5 * inner.velocity_impulse
+        impulse, rate, (reaction,) = delassus.motion(free, inner.impulse, slip)
         both = impulse + reaction
     relations = reduced.normal - delassus.normal_forces(2 * both)
     return Increment(
         impulse=jnp.concatenate([2 * both, relations]),
-        rate=delassus.rates(0.5 * free - delassus.velocity(impulse), reduced),
+        rate=delassus.rates(rate, reduced),
         momentum=rows.momentum,
         velocity_impulse=reaction,
     )

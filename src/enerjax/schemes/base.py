@@ -228,10 +228,14 @@ class StepProblem(eqx.Module):
             return jnp.zeros((0,), state.q.dtype)
         return self.model.joint_rate(state.q, state.v, state.t)
 
-    def delassus_matrix(self, end: Increment) -> DelassusMatrix:
-        """The Delassus matrix in the middle of the step to `end`."""
+    def delassus_matrix(self, end: Increment, *, elastic: bool = False) -> DelassusMatrix:
+        """The Delassus matrix in the middle of the step to `end`.
+
+        If it is `elastic`, it includes the stiffness of strains over the step.
+        """
         middle = 0.5 * (self.start.q + self.position(end))
-        return self.model.delassus_matrix(State(middle, self.start.v, self.middle_time))
+        state = State(middle, self.start.v, self.middle_time)
+        return self.model.delassus_matrix(state, self.h if elastic else None)
 
     def constraint_rows(
         self, z: Increment, state: State, jump: tuple[Increment, State] | None = None
@@ -417,7 +421,12 @@ class AbstractSchemeWithChord(AbstractOneSolveScheme[Z, P], Generic[Z, P]):
     inertia. Where these are small, the chord method with this matrix converges quickly, and
     its linear systems have the Delassus matrix `B M^-1 B^T`. Where it fails, the exact
     Jacobian is used.
+
+    - `has_elastic_chord`: whether the approximate Jacobian also contains the stiffness of
+      strains, so that stiff springs and beams do not slow its convergence.
     """
+
+    has_elastic_chord: ClassVar[bool] = False
 
     @abc.abstractmethod
     def delassus_matrix(self, z: Z, problem: P) -> DelassusMatrix:

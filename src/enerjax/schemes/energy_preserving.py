@@ -1,3 +1,5 @@
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 
@@ -44,6 +46,8 @@ class EnergyPreserving(AbstractSchemeWithRotations[Increment, StepProblem]):
     )
     derivative: AbstractDerivative = ChainRule()
 
+    has_elastic_chord: ClassVar[bool] = True
+
     def __check_init__(self):
         check_formulation("EnergyPreserving", self.formulation)
         check_derivative("EnergyPreserving", self.derivative)
@@ -73,7 +77,7 @@ class EnergyPreserving(AbstractSchemeWithRotations[Increment, StepProblem]):
         return problem.rows(z, end, gradient.less(load))  # eq. (14a, c)
 
     def delassus_matrix(self, z: Increment, problem: StepProblem) -> DelassusMatrix:
-        return problem.delassus_matrix(z)
+        return problem.delassus_matrix(z, elastic=self.has_elastic_chord)
 
     def chord(
         self, rows: Increment, problem: StepProblem, delassus: DelassusMatrix

@@ -25,11 +25,52 @@ from .dense import definite_inverse
 _ROUND = 500
 
 
-class Step(NamedTuple):
+class Round(NamedTuple):
     """The nodes of a round, and the neighbours of each when it is eliminated."""
 
     nodes: list[int]
     neighbours: list[list[int]]
+
+
+class Order(NamedTuple):
+    """The order of an elimination: the rounds, and the nodes that they leave.
+
+    - `nodes`: the rows of each node.
+    - `adjacent`: the nodes that are coupled to each.
+    """
+
+    nodes: Sequence[np.ndarray]
+    adjacent: Sequence[set[int]]
+    rounds: list[Round]
+    left: list[int]
+
+    @property
+    def num_left(self) -> int:
+        return sum(self.nodes[k].size for k in self.left)
+
+    def shape(self, number: int) -> tuple[int, int, int, int]:
+        """For a round: how many neighbours a node has at most, how many rows these have
+        and the node, and the number of nodes."""
+        nodes, neighbours = self.rounds[number]
+        size = lambda k: self.nodes[k].size
+        width = max((size(j) for others in neighbours for j in others), default=0)
+        depth = max(map(len, neighbours))
+        return depth, width, max(map(size, nodes)), len(nodes)
+
+    @property
+    def width(self) -> int:
+        """The number of rows of the largest block."""
+        shapes = map(self.shape, range(len(self.rounds)))
+        return max([self.num_left, *(own for _, _, own, _ in shapes)])
+
+    @property
+    def cost(self) -> float:
+        """About how many multiplications the elimination takes."""
+        shapes = map(self.shape, range(len(self.rounds)))
+        return self.num_left**3 + sum(
+            _ROUND + count * own * (own**2 + d * width * (own + (d + 1) * width / 2))
+            for d, width, own, count in shapes
+        )
 
 
 class Sums(NamedTuple):
@@ -103,14 +144,12 @@ class GraphElimination:
     - `rounds`: the tables of each round.
     - `last`: the places of the entries that they leave, shape `(n, n)`; `last_rows`: the
       places of the rows that they leave, and `last_back` the reverse.
-    - `width`: the number of rows of the largest block. `cost`: about how many
-      multiplications the elimination takes.
     """
 
-    def __init__(self, nodes: Sequence[np.ndarray], adjacent: Sequence[set[int]]):
-        steps, left = _steps(adjacent, [len(rows) for rows in nodes])
-        blocks, num_entries = _all_blocks(nodes, adjacent, steps)
-        layouts = [_layout(blocks, step) for step in steps]
+    def __init__(self, order: Order):
+        nodes, adjacent, rounds, left = order
+        blocks, num_entries = _all_blocks(nodes, adjacent, rounds)
+        layouts = [_layout(blocks, of, order.shape(k)) for k, of in enumerate(rounds)]
         last = [[blocks.of(k, j) for j in left] for k in left]
         last = np.block(last) if left else np.zeros((0, 0), int)
         blocks.number([x for layout in layouts for x in layout] + [last])
@@ -118,22 +157,16 @@ class GraphElimination:
         rows = np.arange(blocks.count)
         self.entries = np.array(blocks.entries)[entries]
         self.rounds = []
-        for step, layout in zip(steps, layouts, strict=True):
-            of_entries, entries = _entries_of_round(blocks, step, layout, entries)
-            of_rows, rows = _rows_of_round(blocks, step, layout[1].shape, rows)
+        for of, layout in zip(rounds, layouts, strict=True):
+            of_entries, entries = _entries_of_round(blocks, of, layout, entries)
+            of_rows, rows = _rows_of_round(blocks, of, layout[1].shape, rows)
             self.rounds.append((of_entries, of_rows))
         place = np.full(len(blocks.entries), entries.size)
         place[entries] = np.arange(entries.size)
         self.last = place[last]
-        order = {int(row): k for k, row in enumerate(rows)}
-        self.last_rows = np.array([order[int(x)] for k in left for x in nodes[k]], int)
+        back = {int(row): k for k, row in enumerate(rows)}
+        self.last_rows = np.array([back[int(x)] for k in left for x in nodes[k]], int)
         self.last_back = np.argsort(self.last_rows)
-        shapes = [x.couplings.shape for x, _ in self.rounds]
-        self.width = max([self.last_rows.size, *(own for _, _, own, _ in shapes)])
-        self.cost = self.last_rows.size**3 + sum(
-            _ROUND + count * own * (own**2 + d * width * (own + (d + 1) * width / 2))
-            for d, width, own, count in shapes
-        )
 
     @property
     def description(self) -> str:
@@ -179,14 +212,23 @@ def _inverses(matrices: Float[Array, "b b p"]) -> Float[Array, "b b p"]:
     return jax.vmap(definite_inverse, in_axes=2, out_axes=2)(matrices)
 
 
-def _steps(adjacent: Sequence[set[int]], sizes: list[int]) -> tuple[list[Step], list[int]]:
-    """The rounds, and the nodes that they leave."""
-    near = [set(others) for others in adjacent]
-    left, steps = set(range(len(near))), []
+def elimination_order(
+    nodes: Sequence[np.ndarray],
+    adjacent: Sequence[set[int]],
+    most_rounds: float = np.inf,
+) -> Order | None:
+    """The order for a matrix with the given rows of nodes and couplings of nodes.
+
+    `None` if it takes more than `most_rounds`.
+    """
+    near, sizes = [set(others) for others in adjacent], [len(rows) for rows in nodes]
+    left, rounds = set(range(len(near))), []
     # A dense matrix of few rows is cheaper than one more round.
     while len(left) > 1 and sum(sizes[k] for k in left) > 4:
         if len(left) > 3 and all(len(near[k]) == len(left) - 1 for k in left):
             break
+        if len(rounds) >= most_rounds:
+            return None
         fill = {k: _fill(near, k) for k in left}
         most = max(1, min(fill.values()))
         chosen, blocked = [], set[int]()
@@ -195,13 +237,13 @@ def _steps(adjacent: Sequence[set[int]], sizes: list[int]) -> tuple[list[Step], 
                 chosen.append(k)
                 blocked |= near[k]
         chosen.sort()
-        steps.append(Step(chosen, [sorted(near[k]) for k in chosen]))
+        rounds.append(Round(chosen, [sorted(near[k]) for k in chosen]))
         for k in chosen:
             left.remove(k)
             for j in near[k]:
                 near[j] |= near[k]
                 near[j] -= {j, k}
-    return steps, sorted(left)
+    return Order(nodes, adjacent, rounds, sorted(left))
 
 
 def _fill(near: list[set[int]], k: int) -> int:
@@ -253,7 +295,7 @@ _ZERO, _ONE = -2, -1
 
 
 def _all_blocks(
-    nodes: Sequence[np.ndarray], adjacent: Sequence[set[int]], steps: list[Step]
+    nodes: Sequence[np.ndarray], adjacent: Sequence[set[int]], rounds: list[Round]
 ) -> tuple[_Blocks, int]:
     """The blocks of the matrix and then of its fill, and the entries of the former."""
     blocks = _Blocks(nodes)
@@ -261,23 +303,23 @@ def _all_blocks(
         for j in (k, *others):
             blocks.of(k, j)
     count = len(blocks.entries)
-    for step in steps:
-        for others in step.neighbours:
+    for of in rounds:
+        for others in of.neighbours:
             for k, j in itertools.combinations(others, 2):
                 blocks.of(k, j)
     return blocks, count
 
 
-def _layout(blocks: _Blocks, step: Step) -> tuple[np.ndarray, np.ndarray]:
+def _layout(
+    blocks: _Blocks, of: Round, shape: tuple[int, int, int, int]
+) -> tuple[np.ndarray, np.ndarray]:
     """The entries of the pivots and of the couplings of a round."""
     size = lambda k: blocks.nodes[k].size
-    own = max(map(size, step.nodes))
-    width = max((size(j) for others in step.neighbours for j in others), default=0)
-    depth = max(map(len, step.neighbours))
-    pivots = np.full((own, own, len(step.nodes)), _ZERO)
+    depth, width, own, count = shape
+    pivots = np.full((own, own, count), _ZERO)
     pivots[np.arange(own), np.arange(own)] = _ONE
-    couplings = np.full((depth, width, own, len(step.nodes)), _ZERO)
-    for p, (k, others) in enumerate(zip(step.nodes, step.neighbours, strict=True)):
+    couplings = np.full((depth, width, own, count), _ZERO)
+    for p, (k, others) in enumerate(zip(of.nodes, of.neighbours, strict=True)):
         pivots[: size(k), : size(k), p] = blocks.of(k, k)
         for d, j in enumerate(others):
             couplings[d, : size(j), : size(k), p] = blocks.of(j, k)
@@ -286,7 +328,7 @@ def _layout(blocks: _Blocks, step: Step) -> tuple[np.ndarray, np.ndarray]:
 
 def _entries_of_round(
     blocks: _Blocks,
-    step: Step,
+    of: Round,
     layout: tuple[np.ndarray, np.ndarray],
     before: np.ndarray,
 ) -> tuple[EntriesOfRound, np.ndarray]:
@@ -298,7 +340,7 @@ def _entries_of_round(
     place = np.full(len(blocks.entries) + 2, before.size)
     place[_ONE] = before.size + 1
     place[before] = np.arange(before.size)
-    changes = _changes_of_entries(blocks, step, couplings.shape)
+    changes = _changes_of_entries(blocks, of, couplings.shape)
     changed = blocks.sorted(np.array(list(changes), int))
     used = np.concatenate([pivots.ravel(), couplings.ravel(), changed])
     after = np.concatenate([changed, blocks.sorted(before[~np.isin(before, used)])])
@@ -310,7 +352,7 @@ def _entries_of_round(
 
 
 def _rows_of_round(
-    blocks: _Blocks, step: Step, shape: tuple[int, ...], before: np.ndarray
+    blocks: _Blocks, of: Round, shape: tuple[int, ...], before: np.ndarray
 ) -> tuple[RowsOfRound, np.ndarray]:
     """The rows of a round, and those that are left after it.
 
@@ -319,7 +361,7 @@ def _rows_of_round(
     depth, width, own, count = shape
     mine = np.full((own, count), blocks.count)
     near = np.full((depth, width, count), blocks.count)
-    for p, (k, others) in enumerate(zip(step.nodes, step.neighbours, strict=True)):
+    for p, (k, others) in enumerate(zip(of.nodes, of.neighbours, strict=True)):
         mine[: blocks.nodes[k].size, p] = blocks.nodes[k]
         for d, j in enumerate(others):
             near[d, : blocks.nodes[j].size, p] = blocks.nodes[j]
@@ -341,7 +383,7 @@ def _rows_of_round(
 
 
 def _changes_of_entries(
-    blocks: _Blocks, step: Step, shape: tuple[int, ...]
+    blocks: _Blocks, of: Round, shape: tuple[int, ...]
 ) -> dict[int, list[int]]:
     """The places of what is subtracted from each entry in a round."""
     depth, width, _, count = shape
@@ -349,7 +391,7 @@ def _changes_of_entries(
     products = np.arange(one.size * width * width * count)
     products = products.reshape(one.size, width, width, count)
     entries: dict[int, list[int]] = {}
-    for p, others in enumerate(step.neighbours):
+    for p, others in enumerate(of.neighbours):
         for pair, (d, e) in enumerate(zip(one, other, strict=True)):
             if d >= len(others):
                 continue

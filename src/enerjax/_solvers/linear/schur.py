@@ -26,7 +26,7 @@ from ..._programs import (
 )
 from .block_diagonal import BlockDiagonal, Symmetric
 from .colours import coloured_products, column_colours
-from .graph_elimination import Factors, GraphElimination
+from .graph_elimination import elimination_order, Factors, GraphElimination, Order
 
 
 # The number of unknowns up to which `B` is treated as dense.
@@ -55,36 +55,35 @@ class SchurTables(Indices):
     - `diagonal`: the places of the diagonal entries.
     """
 
-    def __init__(self, pattern: "scipy.sparse.csr_array", weight: Symmetric):
+    def __init__(
+        self,
+        pattern: "scipy.sparse.csr_array",
+        segments: "_Segments",
+        order: Order,
+        colours: np.ndarray,
+    ):
         self.num_rows, size = shape_of(pattern)
-        is_blocks = isinstance(weight, BlockDiagonal)
-        blocks = weight.places.rows if is_blocks else np.arange(size)[None]
         rows, columns = pattern.nonzero()
+        blocks = segments.blocks
         super().__init__(np.concatenate([rows, columns, blocks.ravel(), blocks.shape]))
-        self.colours = column_colours(pattern, np.arange(size))
-        label = np.zeros(size + 1, int)
-        label[blocks.ravel()] = np.repeat(np.arange(len(blocks)), blocks.shape[1])
-        shape = self.num_rows, len(blocks)
-        incidence = scipy.sparse.csr_array(
-            (np.ones(rows.size), (rows, label[columns])), shape=shape
-        )
-        counts = np.diff(incidence.indptr)
-        within = np.arange(incidence.nnz) - np.repeat(incidence.indptr[:-1], counts)
-        self.touched = np.full((self.num_rows, max(counts.max(initial=0), 1)), len(blocks))
-        self.touched[np.repeat(np.arange(self.num_rows), counts), within] = (
-            incidence.indices
-        )
+        self.colours = colours
+        self.touched = segments.touched
         none = np.full((1, blocks.shape[1]), size)
         self.columns = np.concatenate([blocks, none])[self.touched]
         self.read = with_any(self.columns, size)
         self._find_entries(rows, columns, size)
-        found = _eliminations(self.touched, scipy.sparse.csr_array(incidence @ incidence.T))
-        self.elimination = min(found, key=lambda x: x.cost)
+        self.elimination = GraphElimination(order)
         self._find_shared()
 
     @property
     def description(self) -> str:
         return f"{self.num_rows} rows, {self.elimination.description}"
+
+    def products(
+        self, fn: Callable[[Array], Array], at: Float[Array, " n"]
+    ) -> Float[Array, "rows colours"]:
+        """For each colour, the sum of the columns of `B`, the Jacobian of `fn`."""
+        return coloured_products(fn, at, self.colours)
 
     def _find_entries(self, rows: np.ndarray, columns: np.ndarray, size: int) -> None:
         num_colours = int(self.colours.max(initial=0)) + 1
@@ -122,19 +121,45 @@ class SchurTables(Indices):
         self.diagonal = diagonal[np.argsort(rows[diagonal])]
 
 
-def _eliminations(
-    touched: Int[np.ndarray, "rows segments"], coupling: "scipy.sparse.csr_array"
-) -> Iterator[GraphElimination]:
-    """By the nodes of rows that act on the same bodies, and by the blocks of a band.
+class _Segments:
+    """The segments of the rows of `B`, and the orders in which they can be eliminated.
 
-    The graph of a net has no small separators, but it is a band.
+    - `blocks`: the unknowns of each block of `W`; `touched`: see `SchurTables`.
     """
-    yield _elimination(np.unique(touched, axis=0, return_inverse=True)[1], coupling)
-    order = scipy.sparse.csgraph.reverse_cuthill_mckee(coupling, symmetric_mode=True)
-    sizes = _block_sizes(scipy.sparse.csr_array(coupling[order][:, order]))
-    labels = np.empty(order.size, int)
-    labels[order] = np.repeat(np.arange(sizes.size), sizes)
-    yield _elimination(labels, coupling)
+
+    def __init__(self, pattern: "scipy.sparse.csr_array", weight: Symmetric):
+        num_rows, size = shape_of(pattern)
+        is_blocks = isinstance(weight, BlockDiagonal)
+        self.blocks = weight.places.rows if is_blocks else np.arange(size)[None]
+        rows, columns = pattern.nonzero()
+        count = len(self.blocks)
+        label = np.zeros(size + 1, int)
+        label[self.blocks.ravel()] = np.repeat(np.arange(count), self.blocks.shape[1])
+        incidence = scipy.sparse.csr_array(
+            (np.ones(rows.size), (rows, label[columns])), shape=(num_rows, count)
+        )
+        counts = np.diff(incidence.indptr)
+        within = np.arange(incidence.nnz) - np.repeat(incidence.indptr[:-1], counts)
+        self.touched = np.full((num_rows, max(counts.max(initial=0), 1)), count)
+        self.touched[np.repeat(np.arange(num_rows), counts), within] = incidence.indices
+        self._coupling = scipy.sparse.csr_array(incidence @ incidence.T)
+
+    def orders(self, most_rounds: float) -> Iterator[Order | None]:
+        """By the nodes of rows that act on the same bodies, and by the blocks of a band.
+
+        The graph of a net has no small separators, but it is a band. Its blocks are large,
+        so this is not an order with few rounds.
+        """
+        coupling = self._coupling
+        labels = np.unique(self.touched, axis=0, return_inverse=True)[1]
+        yield _order(labels, coupling, most_rounds)
+        if most_rounds < np.inf:
+            return
+        order = scipy.sparse.csgraph.reverse_cuthill_mckee(coupling, symmetric_mode=True)
+        sizes = _block_sizes(scipy.sparse.csr_array(coupling[order][:, order]))
+        labels = np.empty(order.size, int)
+        labels[order] = np.repeat(np.arange(sizes.size), sizes)
+        yield _order(labels, coupling)
 
 
 def _block_sizes(pattern: "scipy.sparse.csr_array") -> np.ndarray:
@@ -166,16 +191,18 @@ def _block_sizes(pattern: "scipy.sparse.csr_array") -> np.ndarray:
     return min(candidates, key=lambda sizes: sizes.size * int(sizes.max()) ** 3)
 
 
-def _elimination(
-    labels: Int[np.ndarray, " rows"], coupling: "scipy.sparse.csr_array"
-) -> GraphElimination:
+def _order(
+    labels: Int[np.ndarray, " rows"],
+    coupling: "scipy.sparse.csr_array",
+    most_rounds: float = np.inf,
+) -> Order | None:
     count = int(labels.max()) + 1
     nodes = [np.flatnonzero(labels == k) for k in range(count)]
     adjacent = [set[int]() for _ in nodes]
     for row, column in zip(*coupling.nonzero(), strict=True):
         if labels[row] != labels[column]:
             adjacent[labels[row]].add(int(labels[column]))
-    return GraphElimination(nodes, adjacent)
+    return elimination_order(nodes, adjacent, most_rounds)
 
 
 class Schur(eqx.Module):
@@ -205,31 +232,45 @@ class Schur(eqx.Module):
 
 
 def schur_tables(
-    fn: Callable[[Array], Array], like: Float[Array, " n"], weight: Symmetric
+    fn: Callable[[Array], Array],
+    like: Float[Array, " n"],
+    weight: Symmetric,
+    colours: np.ndarray | None = None,
+    most_rounds: float = np.inf,
 ) -> SchurTables | None:
-    """The tables for the Jacobian of `fn`; `None` if it has no rows or too large blocks."""
+    """The tables for the Jacobian of `fn`.
+
+    The `colours` of its columns are found, unless those of a Jacobian with more rows are
+    given. `None` if it has no rows, too large blocks, or needs more rounds of elimination
+    than `most_rounds`.
+    """
     num_rows = jax.eval_shape(fn, like).shape[0]
     pattern = jacobian_pattern(fn, like) if like.size > _FEW else None
     if num_rows == 0:
         return None
     if pattern is None:
-        pattern = scipy.sparse.csr_array(np.ones((num_rows, like.size), bool))
-    tables = SchurTables(scipy.sparse.csr_array(pattern), weight)
-    return tables if tables.elimination.width <= _WIDEST else None
+        pattern = np.ones((num_rows, like.size), bool)
+    pattern = scipy.sparse.csr_array(pattern)
+    segments = _Segments(pattern, weight)
+    orders = [x for x in segments.orders(most_rounds) if x is not None]
+    order = min(orders, key=lambda x: x.cost, default=None)
+    if order is None or order.width > _WIDEST:
+        return None
+    if colours is None:
+        colours = column_colours(pattern, np.arange(like.size))
+    return SchurTables(pattern, segments, order, colours)
 
 
 def schur(
     tables: SchurTables,
-    fn: Callable[[Array], Array],
-    at: Float[Array, " n"],
+    products: Float[Array, "rows colours"],
     weight: Symmetric,
     regularisation: Float[Array, " rows"] | None = None,
 ) -> Schur:
-    """The factorised `G`, where `B` is the Jacobian of `fn` at a point.
+    """The factorised `G`, from the `products` of its tables.
 
     With a `regularisation`, this is added to the diagonal of a `G` that may be singular.
     """
-    products = coloured_products(fn, at, tables.colours)
     rows, weighted = _weighted(tables, products, weight)
     entries = _entries(tables, rows, weighted)
     if regularisation is not None:

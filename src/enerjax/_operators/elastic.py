@@ -1,0 +1,172 @@
+"""The stiffness of strains, as rows beside those of the joints.
+
+A strain energy `Gamma . K Gamma / 2` adds about `h^2/4 Gamma'^T K Gamma'` to the inertia of
+a step of length `h`. With `K = R^T R` this is `S^T S`, where the rows of `S` are
+`h/2 R Gamma'`. The equations `(M + S^T S) u = r` are those of an inertia `M` with one more
+constraint for each row of `S`, which yields to its multiplier `x`:
+
+    M u + S^T x = r,   S u - x = 0
+
+So stiffness enters the matrix `B M^-1 B^T` of the joints as further rows `S`, with one
+added to their diagonal, and the inertia keeps its blocks.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._programs import call_traced_once, squares_in
+from .._solvers import Schur, schur, schur_tables, SchurTables, Symmetric
+from .._system import AbstractStrainEnergy
+from .._types import Args, Coordinates, JointMultipliers, Scalar, Velocities
+
+
+# Chains and trees of `n` bodies need about `log n` rounds, and a large net needs many. Its
+# program takes longer to compile than one with the exact Jacobian.
+_MOST_ROUNDS = 16
+
+# A potential energy `V(q, args)`.
+Potential: TypeAlias = Callable[[Coordinates, Args], Scalar]
+# Rates of the joints, followed by the rows of the strains.
+Rates: TypeAlias = Callable[[Velocities], Float[Array, " rows"]]
+
+
+class ElasticTables(NamedTuple):
+    """The index tables of the joints, and those of joints and strains together.
+
+    The colours of the columns are equal, so one set of products serves both.
+    """
+
+    joints: SchurTables
+    both: SchurTables
+
+    @property
+    def description(self) -> str:
+        count = self.both.num_rows - self.joints.num_rows
+        return f"{self.both.description}; {count} of the rows are those of strains"
+
+    def schurs(
+        self,
+        rates: Rates,
+        rest: Velocities,
+        weight: Symmetric,
+        added: JointMultipliers | None,
+    ) -> tuple[Schur, Schur]:
+        """The factors without and with strains; `added` is the regularisation of joints."""
+        products = self.both.products(rates, rest)
+        num_joints = self.joints.num_rows
+        ones = jnp.ones((self.both.num_rows - num_joints,), rest.dtype)
+        of_joints = jnp.zeros((num_joints,), rest.dtype) if added is None else added
+        diagonal = jnp.concatenate([of_joints, ones])
+        return (
+            schur(self.joints, products[:num_joints], weight, added),
+            schur(self.both, products, weight, diagonal),
+        )
+
+
+def elastic_tables(
+    rates: Rates, num_joints: int, rest: Velocities, weight: Symmetric
+) -> ElasticTables | None:
+    """The tables for `rates`; `None` if the elimination would be long, as that of a net."""
+    both = schur_tables(rates, rest, weight, most_rounds=_MOST_ROUNDS)
+    if both is None:
+        return None
+    joints = schur_tables(lambda v: rates(v)[:num_joints], rest, weight, both.colours)
+    return None if joints is None else ElasticTables(joints, both)
+
+
+class Elasticity(NamedTuple):
+    """The strains of a potential as functions of the coordinates.
+
+    - `values(q)`: strains for each kind, shape `(elements, m)`.
+    - `stiffness`: their stiffness matrices, shape `(elements, m, m)`.
+    """
+
+    values: Callable[[Coordinates], list[Float[Array, "elements m"]]]
+    stiffness: list[Float[Array, "elements m m"]]
+
+    @property
+    def num_strains(self) -> int:
+        return sum(x.shape[0] * x.shape[1] for x in self.stiffness)
+
+
+def elasticity(potential: Potential, q: Coordinates, args: Args) -> Elasticity:
+    """The strains that a potential tells, or the numbers whose squares it sums.
+
+    For other energies, such as those of nonlinear springs, there are none.
+    """
+    if isinstance(potential, AbstractStrainEnergy):
+        like = jax.eval_shape(lambda q: potential.strains(q, args), q)
+        if like:
+            values = lambda q: [_in_rows(x) for x in potential.strains(q, args)]
+            return Elasticity(values, _stiffnesses(potential, args, like))
+    energy = lambda q: call_traced_once(potential, q, args)
+    found = lambda q: squares_in(energy, q)
+    values = lambda q: [x.value.reshape(-1, 1) for x in found(q)]
+    return Elasticity(values, [2 * x.coefficient.reshape(-1, 1, 1) for x in found(q)])
+
+
+def elastic_rates(
+    strains: Elasticity,
+    q: Coordinates,
+    h: Scalar,
+    lift: Callable[[Velocities], Coordinates],
+) -> Rates:
+    """The linear function `S v` of the velocities, whose coordinates change as `lift(v)`.
+
+    Strains of negative stiffness have rows of zero.
+    """
+    roots = list(map(_root, strains.stiffness))
+
+    def rates(v: Velocities) -> Float[Array, " rows"]:
+        changes = jax.jvp(strains.values, (q,), (lift(v),))[1]
+        rows = [
+            jnp.sum(root * change[:, :, None], axis=1).ravel()
+            for root, change in zip(roots, changes, strict=True)
+        ]
+        return 0.5 * h * jnp.concatenate(rows)
+
+    return rates
+
+
+def _in_rows(strains: Array) -> Float[Array, "elements m"]:
+    """Strains of one number each as a column; others have one row for each element."""
+    width = strains.shape[-1] if strains.ndim > 1 else 1
+    return strains.reshape(-1, width)
+
+
+def _stiffnesses(
+    potential: AbstractStrainEnergy, args: Args, like: tuple[jax.ShapeDtypeStruct, ...]
+) -> list[Float[Array, "elements m m"]]:
+    """The stiffness matrices of the elements of each kind."""
+    width = max(x.shape[-1] if x.ndim > 1 else 1 for x in like)
+
+    def unit(x: jax.ShapeDtypeStruct, k: int) -> Array:
+        if x.ndim == 1:
+            return jnp.full(x.shape, float(k == 0), x.dtype)
+        return jnp.broadcast_to((jnp.arange(x.shape[-1]) == k).astype(x.dtype), x.shape)
+
+    columns = [
+        potential.stresses(tuple(unit(x, k) for x in like), args) for k in range(width)
+    ]
+    return [
+        jnp.stack([_in_rows(x) for x in of_kind[: _in_rows(of_kind[0]).shape[1]]], axis=2)
+        for of_kind in zip(*columns, strict=True)
+    ]
+
+
+def _root(matrices: Float[Array, "elements m m"]) -> Float[Array, "elements m m"]:
+    """The lower Cholesky factors `R^T`; without the columns whose pivot is not positive."""
+    size = matrices.shape[-1]
+    columns, rest = [], matrices
+    for k in range(size):
+        pivot = rest[:, k, k]
+        is_stiff = pivot > 0
+        scale = jnp.where(is_stiff, jnp.sqrt(jnp.where(is_stiff, pivot, 1)), jnp.inf)
+        column = jnp.where(jnp.arange(size) >= k, rest[:, :, k], 0) / scale[:, None]
+        rest = rest - column[:, :, None] * column[:, None, :]
+        columns.append(column)
+    return jnp.stack(columns, axis=2)
