@@ -14,7 +14,7 @@ import space_mechanisms as space
 from jax.flatten_util import ravel_pytree
 
 import enerjax as ej
-from enerjax._operators import DelassusMatrix, make_model
+from enerjax._operators import DelassusMatrix, make_model, SeparableModel
 from enerjax._run import experience
 from enerjax._run.prediction import (
     differences_after,
@@ -269,6 +269,17 @@ STIFF = {
 }
 
 
+def _with_strains(potential, redundant, rng):
+    rows = jnp.asarray(rng.normal(size=(3, 4)))
+    system = ej.System(
+        jnp.diag(jnp.asarray(rng.uniform(0.5, 2, size=12))),
+        STIFF[potential],
+        lambda q, args: jnp.sum(rows * q.reshape(3, 4), axis=1),
+        redundant=redundant,
+    )
+    return system, ej.State(*jnp.asarray(rng.normal(size=(2, 12))))
+
+
 @pytest.mark.parametrize("formulation", ["ggl", "index3"])
 @pytest.mark.parametrize("redundant", [False, True])
 @pytest.mark.parametrize("potential", STIFF)
@@ -278,14 +289,7 @@ STIFF = {
 def test_linear_strains_take_one_correction_too(potential, redundant, formulation):
     """However stiff they are: here 30 to 1000 radians a step."""
     rng = np.random.default_rng(0)
-    rows = jnp.asarray(rng.normal(size=(3, 4)))
-    system = ej.System(
-        jnp.diag(jnp.asarray(rng.uniform(0.5, 2, size=12))),
-        STIFF[potential],
-        lambda q, args: jnp.sum(rows * q.reshape(3, 4), axis=1),
-        redundant=redundant,
-    )
-    start = ej.State(*jnp.asarray(rng.normal(size=(2, 12))))
+    system, start = _with_strains(potential, redundant, rng)
     scheme = ej.EnergyPreserving(formulation)
     for stiffness in (1e5, 1e8):
         before, left = _left_by_one_correction(scheme, system, start, rng, stiffness)
@@ -293,6 +297,48 @@ def test_linear_strains_take_one_correction_too(potential, redundant, formulatio
         # what makes redundant rows regular.
         condition = STEP**2 * stiffness
         assert left <= (1e-5 if redundant else 100 * EPS * condition) * before
+
+
+@pytest.mark.parametrize("alpha", [0.0, pytest.param(0.5, marks=pytest.mark.slow), 1.0])
+@pytest.mark.parametrize("formulation", ["ggl", "index3"])
+@pytest.mark.slow_for("index3-0.0", "ggl-1.0")
+def test_linear_strains_take_few_corrections_in_decaying_steps(alpha, formulation):
+    """Their equations have complex frequencies, those of the chord method real ones."""
+    rng = np.random.default_rng(0)
+    system, start = _with_strains("plain", False, rng)
+    scheme = ej.EnergyDecaying(alpha, formulation)
+    for stiffness in (1.0, 1e2, 1e3, 1e4, 1e8):
+        sizes = _sizes_of_corrections(scheme, system, start, rng, stiffness)
+        # By the third power of a third each; the first one is taken by the reactions. Below
+        # that round-off, by the condition of the stiffness beside the inertia.
+        floor = 1e3 * EPS * (1 + STEP**2 * stiffness) * sizes[0]
+        for before, after in zip(sizes[1:-1], sizes[2:], strict=True):
+            assert after <= max(before / 20, floor)
+
+
+def _sizes_of_corrections(scheme, system, start, rng, args):
+    """The sizes of the residuals before a few corrections of the chord method."""
+    model = make_model(system, start, args)
+    start = model.to_internal(start)
+    problem = scheme.problem(model, start, jnp.asarray(STEP))
+    none = jnp.zeros(model.scales.constraint.size)
+    z = scheme.predict(problem, jnp.zeros(start.v.size), none)
+    flat, unravel = ravel_pytree(z)
+
+    @jax.jit
+    def corrected(flat):
+        residual = scheme.residual(unravel(flat), problem)
+        matrix = scheme.delassus_matrix(unravel(flat), problem)
+        correction = scheme.chord(residual, problem, matrix)
+        size = jnp.max(jnp.abs(ravel_pytree(residual)[0]))
+        return flat - ravel_pytree(correction)[0], size
+
+    flat = flat + jnp.asarray(rng.normal(size=flat.size))
+    sizes = []
+    for _ in range(6):
+        flat, size = corrected(flat)
+        sizes.append(float(size))
+    return sizes
 
 
 WITH_MOMENTA = [x for x in CHORDS if x not in ("consistent", "momentum")]
@@ -592,6 +638,7 @@ def test_the_stiffness_of_a_net_is_left_to_newton():
     system = ej.System(jnp.eye(2 * size**2), springs, held)
     start = ej.State(jnp.zeros(2 * size**2), jnp.zeros(2 * size**2))
     model = make_model(system, start, None)
+    assert isinstance(model, SeparableModel)
     assert model.has_delassus_matrix
     assert model.elastic_tables is None
 

@@ -270,7 +270,7 @@ class AbstractModel(eqx.Module):
     def delassus_matrix(self, state: State, h: Scalar | None = None) -> DelassusMatrix:
         """`B M^-1 B^T` at a state. It exists only if `has_delassus_matrix`.
 
-        With the length `h` of a step it includes the stiffness of strains, if any.
+        With a length of time `h` it includes the stiffness of strains, `h^2/4 K`, if any.
         """
 
     @abc.abstractmethod

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -99,6 +100,27 @@ class DelassusMatrix(eqx.Module):
         both = self._solve(self.elastic, right[None])[0]
         velocity = free - self.inverse_inertia @ self.elastic.transposed(both)
         return both[: rates.size], velocity, tuple(found)
+
+    def softened(self, free: Float[Array, "k nv"]) -> Float[Array, "k nv"]:
+        """Each of `k` velocities without a part of the motions that strains resist: `u` in
+
+        (M + S^T S) u + C^T x = M free,   C u = C free
+        """
+        if self.elastic is None:
+            return free
+        num_joints = 0 if self.schur is None else self.schur.tables.num_rows
+        right = jax.vmap(self.elastic.product)(free).at[:, :num_joints].set(0)
+        both = self._solve(self.elastic, right)
+        pulled = jax.vmap(self.elastic.transposed)(both)
+        return free - jax.vmap(self.inverse_inertia.__matmul__)(pulled)
+
+    def elastic_force(self, velocity: Velocities) -> Velocities:
+        """`S^T S velocity`"""
+        if self.elastic is None:
+            return jnp.zeros_like(velocity)
+        strains = self.elastic.product(velocity)
+        num_joints = 0 if self.schur is None else self.schur.tables.num_rows
+        return self.elastic.transposed(strains.at[:num_joints].set(0))
 
     def effective(self, multipliers: Multipliers) -> Multipliers:
         """Multipliers of the joints without their part in the null space of `G`.

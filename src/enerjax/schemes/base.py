@@ -228,14 +228,17 @@ class StepProblem(eqx.Module):
             return jnp.zeros((0,), state.q.dtype)
         return self.model.joint_rate(state.q, state.v, state.t)
 
-    def delassus_matrix(self, end: Increment, *, elastic: bool = False) -> DelassusMatrix:
+    def delassus_matrix(
+        self, end: Increment, elastic: Scalar | None = None
+    ) -> DelassusMatrix:
         """The Delassus matrix in the middle of the step to `end`.
 
-        If it is `elastic`, it includes the stiffness of strains over the step.
+        With a length of time `elastic`, such as `h`, it includes the stiffness of strains,
+        `elastic^2/4 K`.
         """
         middle = 0.5 * (self.start.q + self.position(end))
         state = State(middle, self.start.v, self.middle_time)
-        return self.model.delassus_matrix(state, self.h if elastic else None)
+        return self.model.delassus_matrix(state, elastic)
 
     def constraint_rows(
         self, z: Increment, state: State, jump: tuple[Increment, State] | None = None

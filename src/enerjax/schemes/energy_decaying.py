@@ -12,7 +12,7 @@ from ._arguments import (
     check_derivative,
     check_formulation,
 )
-from ._chord import jump_chord
+from ._chord import elastic_length, jump_chord
 from ._discontinuous import (
     jump_energy,
     jump_gradient,
@@ -66,6 +66,7 @@ class EnergyDecaying(AbstractSchemeWithRotations[JumpAndEnd, StepProblem]):
 
     # A jump does not rotate bodies as a step does, so in the plane it would gain nothing.
     rotates_in: ClassVar[tuple[int, ...]] = (3,)
+    has_elastic_chord: ClassVar[bool] = True
 
     alpha: Scalar = eqx.field(converter=as_alpha)
     formulation: Formulation = eqx.field(  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -120,7 +121,8 @@ class EnergyDecaying(AbstractSchemeWithRotations[JumpAndEnd, StepProblem]):
         )
 
     def delassus_matrix(self, z: JumpAndEnd, problem: StepProblem) -> DelassusMatrix:
-        return problem.delassus_matrix(z.end)
+        elastic = elastic_length(self.alpha, problem.h)
+        return problem.delassus_matrix(z.end, elastic=elastic)
 
     def chord(
         self, rows: JumpAndEnd, problem: StepProblem, delassus: DelassusMatrix

@@ -77,7 +77,7 @@ class EnergyPreserving(AbstractSchemeWithRotations[Increment, StepProblem]):
         return problem.rows(z, end, gradient.less(load))  # eq. (14a, c)
 
     def delassus_matrix(self, z: Increment, problem: StepProblem) -> DelassusMatrix:
-        return problem.delassus_matrix(z, elastic=self.has_elastic_chord)
+        return problem.delassus_matrix(z, elastic=problem.h)
 
     def chord(
         self, rows: Increment, problem: StepProblem, delassus: DelassusMatrix
