@@ -126,7 +126,7 @@ def jump_chord(alpha: Scalar, rows: JumpAndEnd, delassus: DelassusMatrix) -> Jum
     v1 = v1 - delassus.velocity(after)
     vj = vj + delassus.velocity(before) / 3
     if delassus.elastic is not None:
-        v1, vj = _velocities_with_strains(alpha, v1, vj, delassus)
+        v1, vj = velocities_with_strains(alpha, v1, vj, delassus)
         change = _multipliers_of_strains(alpha, v1, vj, delassus)
         after, before = after + change[0], before + change[1]
     rate = 0.5 * (v1 + vj)
@@ -179,7 +179,7 @@ def elastic_length(alpha: Scalar, h: Scalar) -> Scalar:
     return h * jnp.sqrt((1 + alpha.astype(h.dtype)) / 3)
 
 
-def _velocities_with_strains(
+def velocities_with_strains(
     alpha: Scalar, v1: Velocities, vj: Velocities, delassus: DelassusMatrix
 ) -> tuple[Velocities, Velocities]:
     """The velocities with stiffness, from those without."""

@@ -1,3 +1,5 @@
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,9 +9,9 @@ from jaxtyping import Array, Float
 from .._operators import AbstractModel, DelassusMatrix, Increment, Reaction, Strains
 from .._programs import is_known
 from .._system import State
-from .._types import Multipliers, Real, Scalar, Velocities
+from .._types import JointMultipliers, Multipliers, Real, Scalar, Velocities
 from ._arguments import alpha_from_spectral_radius, as_alpha
-from ._chord import step_chord
+from ._chord import elastic_length, step_chord, velocities_with_strains
 from .base import AbstractSchemeWithRotations, Formulation, StepEnd, StepProblem
 
 
@@ -50,6 +52,18 @@ class _Jumps(eqx.Module):
     impulse: Float[Array, " ns"]
     strain: Float[Array, " ns"]
     velocity: Velocities
+
+
+def _correction(
+    problem: _Problem,
+    rows: _Unknowns,
+    impulse: Float[Array, " ns"],
+    reaction: JointMultipliers,
+    end: Increment,
+) -> _Unknowns:
+    """The scaled correction: impulses of the strains, the reaction to them, and the end."""
+    jump = eqx.tree_at(lambda jump: jump.velocity_impulse, rows.jump, reaction)
+    return _Unknowns(impulse / problem.scale, jump, end)
 
 
 class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
@@ -95,6 +109,8 @@ class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
     unconstrained bodies; E. Lens and A. Cardona, section 5.2, whose scheme this is on a
     linear oscillator.
     """
+
+    has_elastic_chord: ClassVar[bool] = True
 
     alpha: Scalar
     # Determined at construction: under transformations of JAX `alpha` may be traced.
@@ -180,33 +196,68 @@ class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
         )
 
     def delassus_matrix(self, z: _Unknowns, problem: _Problem) -> DelassusMatrix:
-        return problem.step.delassus_matrix(z.end)
+        elastic = elastic_length(self.alpha, problem.step.h)
+        return problem.step.delassus_matrix(z.end, elastic)
 
     def chord(
         self, rows: _Unknowns, problem: _Problem, delassus: DelassusMatrix
     ) -> _Unknowns:
+        if delassus.elastic is not None:
+            return self._elastic_chord(rows, problem, delassus)
         # Without stiffness the rows of the strains determine their impulses, and these move
         # the velocities at the end of the step and the joints.
-        start = problem.step.start
         impulse = problem.row_scale * rows.strain_impulse
-        momentum = problem.strains.momentum(start.q, impulse)
+        momentum = problem.strains.momentum(problem.step.start.q, impulse)
         moved = delassus.product(delassus.inverse_inertia @ momentum)
-        right = moved - rows.jump.velocity_impulse
-        parts = lambda z: (z.rate, z.velocity_impulse)
         end = eqx.tree_at(
-            parts,
+            lambda z: (z.rate, z.velocity_impulse),
             rows.end,
             (rows.end.rate + momentum, rows.end.velocity_impulse + moved),
         )
-        return _Unknowns(
-            strain_impulse=impulse / problem.scale,
-            jump=eqx.tree_at(
-                lambda jump: jump.velocity_impulse,
-                rows.jump,
-                delassus.solve(right[None])[0],
-            ),
-            end=step_chord(end, delassus),
+        (reaction,) = delassus.solve((moved - rows.jump.velocity_impulse)[None])
+        return _correction(problem, rows, impulse, reaction, step_chord(end, delassus))
+
+    def _elastic_chord(
+        self, rows: _Unknowns, problem: _Problem, delassus: DelassusMatrix
+    ) -> _Unknowns:
+        """The correction with the stiffness of the strains.
+
+        The velocities `v1` of the end and the jump `w` of the velocities by the strains
+        have the equations of the nodes of `EnergyDecaying`; see `_chord.py`.
+        """
+        step, strains, end = problem.step, problem.strains, rows.end
+        h, alpha, inverse = step.h, self._alpha(step.h), delassus.inverse_inertia
+        # The strains change with the position, which is predicted at the middle.
+        middle = step.start.q + 0.5 * h * step.model.lift(step.start.q, step.start.v)
+        own = problem.row_scale * rows.strain_impulse
+        pushed, free = inverse @ strains.momentum(middle, own), inverse @ end.rate
+        slip = end.velocity_impulse
+        right = (delassus.product(pushed), delassus.product(free) - slip)
+        at_jump, at_end = delassus.solve(jnp.stack(right))
+        v1, jump = velocities_with_strains(
+            alpha,
+            free - delassus.velocity(at_end),
+            pushed - delassus.velocity(at_jump),
+            delassus,
         )
+        change = h / 2 * strains.rates(middle, v1 + jump)
+        strain = -h / 6 * strains.rates(middle, v1 - alpha * jump)
+        impulse = own + h / 6 * strains.stresses(change - alpha * strain)
+        force = strains.momentum(middle, h / 2 * strains.stresses(change + strain))
+        moved = delassus.product(inverse @ strains.momentum(middle, impulse))
+        reactions = (
+            delassus.product(inverse @ (end.rate - force)) - slip,
+            moved - rows.jump.velocity_impulse,
+            end.impulse - 0.5 * (slip + moved),
+            end.impulse - 0.5 * slip,
+        )
+        multipliers, at_start, reaction, moving = delassus.solve(jnp.stack(reactions))
+        found = eqx.tree_at(
+            lambda z: (z.impulse, z.rate, z.velocity_impulse),
+            end,
+            (multipliers, 0.5 * (v1 + jump) + delassus.velocity(moving), reaction),
+        )
+        return _correction(problem, rows, impulse, at_start, found)
 
     def finish(self, z: _Unknowns, problem: _Problem) -> StepEnd:
         step, strains = problem.step, problem.strains
