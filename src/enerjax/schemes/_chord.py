@@ -12,7 +12,7 @@ components of the balance of momentum. Where momenta are unknowns, they are take
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .._operators import DelassusMatrix, Increment
 from .._types import JointMultipliers, Scalar, Velocities
@@ -179,12 +179,11 @@ def elastic_length(alpha: Scalar, h: Scalar) -> Scalar:
     return h * jnp.sqrt((1 + alpha.astype(h.dtype)) / 3)
 
 
-def velocities_with_strains(
-    alpha: Scalar, v1: Velocities, vj: Velocities, delassus: DelassusMatrix
-) -> tuple[Velocities, Velocities]:
-    """The velocities with stiffness, from those without."""
+def _divided(
+    alpha: Scalar, free: Float[Array, "k nv"], delassus: DelassusMatrix
+) -> tuple[Float[Array, "k nv"], Float[Array, "k nv"]]:
+    """`k` velocities divided by `1 + tr A T + det A T^2`, and `T` times these."""
     share, trace = (1 + alpha) / 12, (3 + alpha**2) / 36
-    none = jnp.zeros((2, v1.size), v1.dtype)
 
     def add(_: int, sums: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         rest, total, by_stiffness = sums
@@ -194,8 +193,17 @@ def velocities_with_strains(
         moved = (once - twice) / share
         return (2 * share - trace) * moved, total + twice, by_stiffness + moved
 
-    start = jnp.stack([v1, vj]), none, none
-    _, (at_end, at_jump), (by_end, by_jump) = jax.lax.fori_loop(0, _TERMS, add, start)
+    none = jnp.zeros_like(free)
+    _, total, by_stiffness = jax.lax.fori_loop(0, _TERMS, add, (free, none, none))
+    return total, by_stiffness
+
+
+def velocities_with_strains(
+    alpha: Scalar, v1: Velocities, vj: Velocities, delassus: DelassusMatrix
+) -> tuple[Velocities, Velocities]:
+    """The velocities with stiffness, from those without."""
+    divided = _divided(alpha, jnp.stack([v1, vj]), delassus)
+    (at_end, at_jump), (by_end, by_jump) = divided
     v1 = at_end + (alpha**2 - 3) / 36 * by_end - (3 + alpha) / 12 * by_jump
     return v1, at_jump + (3 + alpha) / 36 * by_end + by_jump / 6
 
@@ -210,3 +218,30 @@ def _multipliers_of_strains(
     at_jump = (alpha**2 - 3) / 36 * jump - (3 + alpha) / 36 * end
     moved = [delassus.product(delassus.inverse_inertia @ x) for x in (-at_end, 3 * at_jump)]
     return delassus.solve(jnp.stack(moved))
+
+
+def skew_chord(rows: Increment, delassus: DelassusMatrix) -> Increment:
+    """The correction of a step of order 4, `EnergyConsistent(0)`, with stiff strains:
+
+        v1 = 2 rate - 2 M^-1 C^T eta - M^-1 h^2 K rate / 6
+        M v1 + C^T impulse + h^2 K (rate / 2 - v1 / 12) = r_m
+        C rate = r_phi,   C v1 = r_psi
+
+    Its denominator is that of the nodes above for `alpha = 0`.
+    """
+    if delassus.elastic is None or rows.momentum.size > 0:
+        return step_chord(rows, delassus)
+    inverse, slip = delassus.inverse_inertia, rows.velocity_impulse
+    free = 0.5 * (inverse @ rows.rate)
+    (held,) = delassus.solve((delassus.product(free) - rows.impulse)[None])
+    none = jnp.zeros((), free.dtype)
+    without = free - delassus.velocity(held)
+    rate = _divided(none, without[None], delassus)[0][0]
+    stiff = lambda velocity: 12 * delassus.elastic_force(velocity)
+    moved = inverse @ (stiff(rate) / 12)
+    (eta,) = delassus.solve((rows.impulse - 0.5 * slip - delassus.product(moved))[None])
+    v1 = 2 * (rate - moved - delassus.velocity(eta))
+    force = stiff(0.5 * rate - v1 / 12)
+    balance = delassus.product(inverse @ (rows.rate - force)) - slip
+    (impulse,) = delassus.solve(balance[None])
+    return Increment(impulse, rate, rows.momentum, eta)

@@ -424,12 +424,13 @@ class AbstractSchemeWithChord(AbstractOneSolveScheme[Z, P], Generic[Z, P]):
     inertia. Where these are small, the chord method with this matrix converges quickly, and
     its linear systems have the Delassus matrix `B M^-1 B^T`. Where it fails, the exact
     Jacobian is used.
-
-    - `has_elastic_chord`: whether the approximate Jacobian also contains the stiffness of
-      strains, so that stiff springs and beams do not slow its convergence.
     """
 
-    has_elastic_chord: ClassVar[bool] = False
+    @property
+    def has_elastic_chord(self) -> bool:
+        """Whether the approximate Jacobian also contains the stiffness of strains, so that
+        stiff springs and beams do not slow its convergence."""
+        return False
 
     @abc.abstractmethod
     def delassus_matrix(self, z: Z, problem: P) -> DelassusMatrix:

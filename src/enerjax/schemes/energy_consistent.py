@@ -16,7 +16,7 @@ from ._arguments import (
     check_derivative,
     refuse_nonholonomic,
 )
-from ._chord import step_chord
+from ._chord import elastic_length, skew_chord, step_chord
 from ._discontinuous import JumpAndEnd
 from ._dissipative_stiffness import dissipative_stiffness, DissipativeStiffness
 from .base import AbstractSchemeWithChord, Formulation, StepEnd, StepProblem
@@ -117,6 +117,11 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
     def order(self) -> int:
         return 4 if self.symmetric else 3
 
+    @property
+    def has_elastic_chord(self) -> bool:
+        # The damping of stiffness has a matrix of its own.
+        return isinstance(self.alpha, float)
+
     def problem(self, model: AbstractModel, start: State, h: Scalar) -> _Problem:
         refuse_nonholonomic(
             "EnergyConsistent",
@@ -161,13 +166,16 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
         return JumpAndEnd(jump_rows, self._rows(z.end, problem, end, jump))
 
     def delassus_matrix(self, z: _Unknowns, problem: _Problem) -> DelassusMatrix:
-        return problem.step.delassus_matrix(_end_of(z))
+        elastic = None
+        if problem.dissipative is None:
+            elastic = elastic_length(jnp.zeros_like(problem.step.h), problem.step.h)
+        return problem.step.delassus_matrix(_end_of(z), elastic)
 
     def chord(
         self, rows: _Unknowns, problem: _Problem, delassus: DelassusMatrix
     ) -> _Unknowns:
         if not isinstance(rows, JumpAndEnd):
-            return step_chord(rows, delassus)
+            return skew_chord(rows, delassus)
         # The velocities at the end of the step are reduced by the unknown jump.
         jump = delassus.inverse_inertia @ rows.jump.rate
         end = eqx.tree_at(

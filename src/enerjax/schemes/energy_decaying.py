@@ -66,8 +66,6 @@ class EnergyDecaying(AbstractSchemeWithRotations[JumpAndEnd, StepProblem]):
 
     # A jump does not rotate bodies as a step does, so in the plane it would gain nothing.
     rotates_in: ClassVar[tuple[int, ...]] = (3,)
-    has_elastic_chord: ClassVar[bool] = True
-
     alpha: Scalar = eqx.field(converter=as_alpha)
     formulation: Formulation = eqx.field(  # pyright: ignore[reportIncompatibleMethodOverride]
         default="ggl", static=True
@@ -96,6 +94,10 @@ class EnergyDecaying(AbstractSchemeWithRotations[JumpAndEnd, StepProblem]):
     @property
     def symmetric(self) -> bool:
         return False
+
+    @property
+    def has_elastic_chord(self) -> bool:
+        return True
 
     def problem(self, model: AbstractModel, start: State, h: Scalar) -> StepProblem:
         return StepProblem(model, start, h, self.derivative, self.formulation)

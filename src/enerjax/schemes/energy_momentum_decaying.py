@@ -1,5 +1,3 @@
-from typing import ClassVar
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -110,8 +108,6 @@ class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
     linear oscillator.
     """
 
-    has_elastic_chord: ClassVar[bool] = True
-
     alpha: Scalar
     # Determined at construction: under transformations of JAX `alpha` may be traced.
     is_preserving: bool = eqx.field(static=True)
@@ -137,6 +133,10 @@ class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
     @property
     def order(self) -> int:
         return 2
+
+    @property
+    def has_elastic_chord(self) -> bool:
+        return True
 
     def problem(self, model: AbstractModel, start: State, h: Scalar) -> _Problem:
         if model.has_own_momenta or not model.in_rates.has_canonical_rates:

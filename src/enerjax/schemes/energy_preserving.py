@@ -1,5 +1,3 @@
-from typing import ClassVar
-
 import equinox as eqx
 import jax.numpy as jnp
 
@@ -46,8 +44,6 @@ class EnergyPreserving(AbstractSchemeWithRotations[Increment, StepProblem]):
     )
     derivative: AbstractDerivative = ChainRule()
 
-    has_elastic_chord: ClassVar[bool] = True
-
     def __check_init__(self):
         check_formulation("EnergyPreserving", self.formulation)
         check_derivative("EnergyPreserving", self.derivative)
@@ -58,6 +54,10 @@ class EnergyPreserving(AbstractSchemeWithRotations[Increment, StepProblem]):
 
     @property
     def symmetric(self) -> bool:
+        return True
+
+    @property
+    def has_elastic_chord(self) -> bool:
         return True
 
     def problem(self, model: AbstractModel, start: State, h: Scalar) -> StepProblem:
