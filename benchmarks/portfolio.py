@@ -108,7 +108,7 @@ def measured(work: Work, rounds: int) -> list[Record]:
     for worker in workers:
         worker.close()
     once = {k: x for k, x in ours.record.items() if k != "motions"}
-    rows[0] |= once | (_gradient(work, rounds) if work.has_gradient else {})
+    rows[0] |= once | _gradient(work, rounds)
     for row in rows[1:]:
         # The program of the first row.
         row |= {k: once[k] for k in _OF_PROGRAM if k in once}

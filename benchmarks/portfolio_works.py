@@ -68,7 +68,6 @@ class Work:
     steps: int
     positions: Callable[[Any], np.ndarray]
     motions: tuple[Motion, ...]
-    has_gradient: bool = True
 
     @property
     def gradient_steps(self) -> int:
@@ -127,14 +126,15 @@ def _mechanism(
     return Work(name, scheme, steps, space.mass_centres, (motion,))
 
 
-def _with_springs(name: str, make: Callable[[], space.Mechanism], steps: int) -> Work:
-    """With springs that no step resolves, so that Newton's method takes over.
+def _with_springs(
+    name: str, make: Callable[[], space.Mechanism], scheme: str = PRESERVING
+) -> Work:
+    """With springs that no step resolves.
 
     An angle vibrates `sqrt(1e6 / J)` times a second, with the inertia `J` of a rod, 0.3.
     """
     stiff = lambda: space.with_springs(make(), 1e6)
-    work = _mechanism(name, stiff, steps, Bars())
-    return dataclasses.replace(work, has_gradient=False)
+    return _mechanism(name, stiff, 500, Bars(), scheme=scheme)
 
 
 def _in_plane(q: Any) -> np.ndarray:
@@ -325,8 +325,11 @@ def _works() -> list[Work]:
             )
         ),
         _mechanism("tree-30", lambda: space.tree(30), 500, loops, is_open=True),
-        _with_springs("bodies-16-stiff", lambda: space.chain(16), 500),
-        _with_springs("tree-30-stiff", lambda: space.tree(30), 500),
+        _with_springs("bodies-16-stiff", lambda: space.chain(16)),
+        _with_springs("tree-30-stiff", lambda: space.tree(30)),
+        _with_springs(
+            "bodies-16-stiff-decaying", lambda: space.chain(16), "EnergyDecaying(0.5)"
+        ),
         _mechanism("four-bar-in-space", space.four_bar, 500, loops),
         _mechanism("two-loops", space.two_loops, 500, loops),
         _mechanism("bricard", space.bricard, 500, loops),

@@ -197,7 +197,7 @@ STEP = 0.1
 
 def _left_by_one_correction(scheme, system, start, rng, args=None):
     """The sizes of a residual before and after one correction of the chord method."""
-    model = make_model(system, start, args)
+    model = make_model(system, start, args, elastic=True)
     start = model.to_internal(start)
     problem = scheme.problem(model, start, jnp.asarray(STEP))
     num_constraints = model.scales.constraint.size
@@ -318,7 +318,7 @@ def test_linear_strains_take_few_corrections_in_decaying_steps(alpha, formulatio
 
 def _sizes_of_corrections(scheme, system, start, rng, args):
     """The sizes of the residuals before a few corrections of the chord method."""
-    model = make_model(system, start, args)
+    model = make_model(system, start, args, elastic=True)
     start = model.to_internal(start)
     problem = scheme.problem(model, start, jnp.asarray(STEP))
     none = jnp.zeros(model.scales.constraint.size)
@@ -637,7 +637,7 @@ def test_the_stiffness_of_a_net_is_left_to_newton():
     held = lambda q, args: q[:2]
     system = ej.System(jnp.eye(2 * size**2), springs, held)
     start = ej.State(jnp.zeros(2 * size**2), jnp.zeros(2 * size**2))
-    model = make_model(system, start, None)
+    model = make_model(system, start, None, elastic=True)
     assert isinstance(model, SeparableModel)
     assert model.has_delassus_matrix
     assert model.elastic_tables is None

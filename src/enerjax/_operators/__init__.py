@@ -14,19 +14,25 @@ from .separable import SeparableModel as SeparableModel
 from .strains import Strains as Strains
 
 
+def has_strains(model: AbstractModel) -> bool:
+    """Whether the chord method includes the stiffness of strains, and there are any."""
+    return isinstance(model, SeparableModel) and model.elastic_tables is not None
+
+
 def make_model(
     system: AbstractSystem,
     state: State,
     args: Args,
     *,
     rotates_in: tuple[int, ...] = (),
+    elastic: bool = False,
 ) -> AbstractModel:
     """The model of a system. The scales are those at `state`, which is a user's state.
 
-    Rigid bodies in the dimensions `rotates_in` are moved by rotations; see
-    `SeparableModel`.
+    Rigid bodies in the dimensions `rotates_in` are moved by rotations; if it is `elastic`,
+    the chord method includes the stiffness of strains. See `SeparableModel`.
     """
     if isinstance(system, AbstractCanonicalSystem):
         return CanonicalModel(system, state, args)
     assert isinstance(system, System)
-    return SeparableModel(system, state, args, rotates_in=rotates_in)
+    return SeparableModel(system, state, args, rotates_in=rotates_in, elastic=elastic)

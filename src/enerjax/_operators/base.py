@@ -274,9 +274,7 @@ class AbstractModel(eqx.Module):
         """
 
     @abc.abstractmethod
-    def neglected_by_chord(
-        self, state: State, v: Velocities, h: Scalar, *, elastic: bool
-    ) -> Velocities:
+    def neglected_by_chord(self, state: State, v: Velocities, h: Scalar) -> Velocities:
         """The velocities that stiffness, damping and the change of the inertia cause in a
         step with the velocities `v`: the chord method neglects them."""
 

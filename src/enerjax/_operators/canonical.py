@@ -283,9 +283,7 @@ class CanonicalModel(AbstractModel):
         _, (force, rate, power) = jax.jvp(gradient, at, (rate / h, -force / h, no_time))
         return Gradient(force, rate / h, power)
 
-    def neglected_by_chord(
-        self, state: State, v: Velocities, h: Scalar, *, elastic: bool
-    ) -> Velocities:
+    def neglected_by_chord(self, state: State, v: Velocities, h: Scalar) -> Velocities:
         moved, force = 0.5 * h * v, self.metric(state) @ v
         rows = lambda q, p: (self.slope(State(q, p, state.t)), self.lift(q, p))
         slope, rate = jax.jvp(rows, (state.q, state.v), (moved, force))[1]

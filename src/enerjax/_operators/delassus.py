@@ -102,7 +102,7 @@ class DelassusMatrix(eqx.Module):
         return both[: rates.size], velocity, tuple(found)
 
     def softened(self, free: Float[Array, "k nv"]) -> Float[Array, "k nv"]:
-        """Each of `k` velocities without a part of the motions that strains resist: `u` in
+        """The velocities `u` to which strains reduce each of `k` velocities `free`:
 
         (M + S^T S) u + C^T x = M free,   C u = C free
         """

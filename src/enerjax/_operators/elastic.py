@@ -19,14 +19,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._programs import call_traced_once, squares_in
-from .._solvers import Schur, schur, schur_tables, SchurTables, Symmetric
+from .._solvers import Bounds, Schur, schur, schur_tables, SchurTables, Symmetric
 from .._system import AbstractStrainEnergy
 from .._types import Args, Coordinates, JointMultipliers, Scalar, Velocities
 
 
-# Chains and trees of `n` bodies need about `log n` rounds, and a large net needs many. Its
-# program takes longer to compile than one with the exact Jacobian.
-_MOST_ROUNDS = 16
+# The smallest pivot of a stiffness matrix, as a part of its largest entry.
+_LEAST_PIVOT = 1e-12
+# A spring acts on two bodies, with at most 24 coordinates. Penalties of areas or mean
+# positions act on all bodies, and would couple all rows, as would many springs on one body.
+# Chains and trees of `n` bodies need about `log n` rounds, and a large net needs many.
+# Programs for these take longer to compile than those with the exact Jacobian.
+_BOUNDS = Bounds(blocks=24, rows=64, rounds=16)
 
 # A potential energy `V(q, args)`.
 Potential: TypeAlias = Callable[[Coordinates, Args], Scalar]
@@ -71,7 +75,7 @@ def elastic_tables(
     rates: Rates, num_joints: int, rest: Velocities, weight: Symmetric
 ) -> ElasticTables | None:
     """The tables for `rates`; `None` if the elimination would be long, as that of a net."""
-    both = schur_tables(rates, rest, weight, most_rounds=_MOST_ROUNDS)
+    both = schur_tables(rates, rest, weight, bounds=_BOUNDS)
     if both is None:
         return None
     joints = schur_tables(lambda v: rates(v)[:num_joints], rest, weight, both.colours)
@@ -94,7 +98,7 @@ class Elasticity(NamedTuple):
 
 
 def elasticity(potential: Potential, q: Coordinates, args: Args) -> Elasticity:
-    """The strains that a potential tells, or the numbers whose squares it sums.
+    """The strains that a potential declares, or the numbers whose squares it sums.
 
     For other energies, such as those of nonlinear springs, there are none.
     """
@@ -159,12 +163,14 @@ def _stiffnesses(
 
 
 def _root(matrices: Float[Array, "elements m m"]) -> Float[Array, "elements m m"]:
-    """The lower Cholesky factors `R^T`; without the columns whose pivot is not positive."""
+    """The lower Cholesky factors `R^T`, without the columns whose pivot is not positive, or
+    so small that it is round-off."""
     size = matrices.shape[-1]
+    least = _LEAST_PIVOT * jnp.max(jnp.diagonal(matrices, axis1=1, axis2=2), axis=1)
     columns, rest = [], matrices
     for k in range(size):
         pivot = rest[:, k, k]
-        is_stiff = pivot > 0
+        is_stiff = pivot > jnp.maximum(least, 0)
         scale = jnp.where(is_stiff, jnp.sqrt(jnp.where(is_stiff, pivot, 1)), jnp.inf)
         column = jnp.where(jnp.arange(size) >= k, rest[:, :, k], 0) / scale[:, None]
         rest = rest - column[:, :, None] * column[:, None, :]

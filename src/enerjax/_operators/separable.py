@@ -87,7 +87,7 @@ class SeparableModel(AbstractModel):
     kinematics: AbstractKinematics
     # The index tables of `delassus_matrix`; `None` where there is none.
     constraint_tables: SchurTables | None = eqx.field(static=True)
-    # The same with the rows of strains; `None` if the chord method leaves them out.
+    # The same with the rows of strains; `None` where the chord method omits stiffness.
     elastic_tables: ElasticTables | None = eqx.field(static=True)
     # The model with the velocities of the user, if those of this one are others.
     without_rotations: "SeparableModel | None"
@@ -99,6 +99,7 @@ class SeparableModel(AbstractModel):
         args: Args,
         *,
         rotates_in: tuple[int, ...] = (),
+        elastic: bool = False,
     ):
         self.system = system
         self.args = args
@@ -116,7 +117,7 @@ class SeparableModel(AbstractModel):
         self.inverse_inertia = inverse_of(self.inertia)
         self.scales = self._scales(state)
         self.constraint_tables = self._constraint_tables(state)
-        self.elastic_tables = self._elastic_tables(state)
+        self.elastic_tables = self._elastic_tables(state) if elastic else None
 
     @property
     def has_own_momenta(self) -> bool:
@@ -200,9 +201,7 @@ class SeparableModel(AbstractModel):
             return slope
         return slope - self.pull(q, q, self.force(q, state.v, state.t))
 
-    def neglected_by_chord(
-        self, state: State, v: Velocities, h: Scalar, *, elastic: bool
-    ) -> Velocities:
+    def neglected_by_chord(self, state: State, v: Velocities, h: Scalar) -> Velocities:
         def acceleration(q: Coordinates, v: Velocities) -> Velocities:
             rows = self.slope(State(q, v, state.t))
             is_rotated = self.without_rotations is not None
@@ -211,9 +210,9 @@ class SeparableModel(AbstractModel):
 
         moved = 0.5 * h * self.lift(state.q, v)
         change = 0.5 * h * jax.jvp(acceleration, (state.q, state.v), (moved, v))[1]
-        if not elastic or self.elastic_tables is None:
+        if self.elastic_tables is None:
             return change
-        # Up to geometric stiffness the strains of springs cause all of it.
+        # The chord method does not neglect the part that the strains cause.
         of_strains, transpose = jax.vjp(self._rates_of_strains(state.q, h), v)
         return change - self.inverse_inertia @ transpose(of_strains)[0]
 
@@ -476,8 +475,9 @@ class SeparableModel(AbstractModel):
     def _elastic_tables(self, state: State) -> ElasticTables | None:
         """The tables of joints and strains together.
 
-        `None` where there are no strains, where coordinates are redundant, and where there
-        are more strains than velocities: the exact Jacobian is smaller then.
+        `None` where there are no strains, where coordinates are redundant, where there are
+        more strains than velocities, and where the elimination would be long: the exact
+        Jacobian is better then.
         """
         q, rest = state.q, jnp.zeros_like(self.inertia.diagonal())
         if self.constraint_tables is None or self._frames(q) is not None:

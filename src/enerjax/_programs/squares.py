@@ -26,7 +26,7 @@ class Squares(NamedTuple):
 
 
 def squares_in(fn: Callable[[Array], Array], x: Array) -> list[Squares]:
-    """The squares of which `fn(x)` is the sum, without the rest of it."""
+    """The squares that `fn(x)` sums, beside other terms."""
     # Equal operations must be one, or factors of a square would not be the same array.
     closed = jax.make_jaxpr(simplified(fn))(x)
     known = [_Known(value, False) for value in closed.consts]

@@ -15,7 +15,14 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from .._operators import AbstractModel, Increment, roughness, scales_like, shortened
+from .._operators import (
+    AbstractModel,
+    has_strains,
+    Increment,
+    roughness,
+    scales_like,
+    shortened,
+)
 from .._programs import part, simplified
 from .._results import first_failure, from_root_finder, RESULTS
 from .._solvers import (
@@ -147,7 +154,7 @@ def solve(
         skip=skip,
         regularisation=_regularisation(model, prepared.scales),
         least=prepared.least,
-        chord=_chord(scheme) if alone or wait is not None else None,
+        chord=_chord(scheme, model) if alone or wait is not None else None,
         by_chord=True if wait is None else wait == 0,
         owners=owners_of(prepared.guess, model.num_joints),
         rarely=rarely or wait is not None,
@@ -159,11 +166,6 @@ def solve(
 def has_chord(scheme: AbstractOneSolveScheme, model: AbstractModel) -> bool:
     """Whether the step equations have a chord method."""
     return isinstance(scheme, AbstractSchemeWithChord) and model.has_delassus_matrix
-
-
-def has_elastic_chord(scheme: AbstractOneSolveScheme) -> bool:
-    """Whether the chord method includes the stiffness of strains."""
-    return isinstance(scheme, AbstractSchemeWithChord) and scheme.has_elastic_chord
 
 
 def is_chord_alone(
@@ -282,7 +284,7 @@ def _solved(
     )
 
 
-def _chord(scheme: AbstractOneSolveScheme) -> Chord:
+def _chord(scheme: AbstractOneSolveScheme, model: AbstractModel) -> Chord:
     """The corrections of the chord method of a scheme, for scaled unknowns and rows."""
     assert isinstance(scheme, AbstractSchemeWithChord)
 
@@ -305,7 +307,7 @@ def _chord(scheme: AbstractOneSolveScheme) -> Chord:
         z = _with_multipliers(jax.tree.map(jnp.multiply, x, scales.unknown), new)
         return jax.tree.map(jnp.multiply, z, scales.per_unknown)
 
-    return Chord(prepare, correct, effective)
+    return Chord(prepare, correct, effective, has_strains(model))
 
 
 def num_unknowns(memory: Memory) -> int:

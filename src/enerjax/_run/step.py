@@ -13,7 +13,12 @@ from .._results import first_of, RESULTS
 from .._solvers import ChordAlone, largest, Newton, RootFinder
 from .._system import AbstractSystem, State
 from .._types import Args, Coordinates, Count, Flag, Multipliers, Real, Scalar, Velocities
-from ..schemes import AbstractScheme, AbstractSchemeWithRotations, Energies
+from ..schemes import (
+    AbstractScheme,
+    AbstractSchemeWithChord,
+    AbstractSchemeWithRotations,
+    Energies,
+)
 from .halving import solve_or_divide
 from .inputs import check_halvings, prepare
 from .prediction import Memory
@@ -69,11 +74,13 @@ class StepOutput(eqx.Module):
 def model_for(
     scheme: AbstractScheme, system: AbstractSystem, state: State, args: Args
 ) -> AbstractModel:
-    """The model of a system for a scheme, which may move rigid bodies by rotations."""
+    """The model of a system for a scheme, which may move rigid bodies by rotations, and may
+    include the stiffness of strains in its chord method."""
     stage = scheme.stage
     has_rotations = isinstance(stage, AbstractSchemeWithRotations)
     rotates_in = stage.rotates_in if has_rotations else ()
-    return make_model(system, state, args, rotates_in=rotates_in)
+    elastic = isinstance(stage, AbstractSchemeWithChord) and stage.has_elastic_chord
+    return make_model(system, state, args, rotates_in=rotates_in, elastic=elastic)
 
 
 def first_warm(

@@ -22,7 +22,6 @@ from .._system import closes_over_traced_values, System
 from .._types import Scalar
 from .experience import Experience
 from .loop import dispensable_newton
-from .stage import has_elastic_chord
 from .step import model_for
 from .task import Task
 
@@ -81,7 +80,6 @@ def _contraction(task: Task) -> Scalar:
     With constant inertia it is the spectral radius of `h^2/4 M^-1 K + h/2 M^-1 D`, with the
     stiffness and damping of the forces that its matrix omits, by power iteration.
     """
-    elastic = has_elastic_chord(task.scheme.stage)
     model = model_for(task.scheme, task.system, task.start, task.args)
     start, h = model.to_internal(task.start), task.plan.unit
     is_separable = isinstance(model, SeparableModel)
@@ -89,7 +87,7 @@ def _contraction(task: Task) -> Scalar:
     size = lambda v: jnp.sqrt(v @ inertia @ v)
 
     def after(v: jax.Array, _: None) -> tuple[jax.Array, Scalar]:
-        change = model.neglected_by_chord(start, v, h, elastic=elastic)
+        change = model.neglected_by_chord(start, v, h)
         return change / jnp.maximum(size(change), jnp.finfo(h.dtype).tiny), size(change)
 
     v = jnp.cos(jnp.arange(1.0, start.v.size + 1)).astype(h.dtype)

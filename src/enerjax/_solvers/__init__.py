@@ -36,6 +36,7 @@ from .linear.jacobian import (
 )
 from .linear.norms import largest as largest
 from .linear.schur import (
+    Bounds as Bounds,
     Schur as Schur,
     schur as schur,
     schur_tables as schur_tables,

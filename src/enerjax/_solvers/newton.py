@@ -17,8 +17,9 @@ class Newton(eqx.Module):
 
     **Chord method.** A search begins with it if the scheme offers it, as the energy schemes
     do. Its approximate Jacobian contains the inertia and the constraint gradients in the
-    middle of the step, and no stiffness. It is factorised once. If it does not reduce the
-    residual quickly (stiff forces, fast rotations), the exact Jacobian is used.
+    middle of the step, and for most schemes the stiffness of springs and beams. It is
+    factorised once. If it does not reduce the residual quickly (other stiff forces, fast
+    rotations), the exact Jacobian is used.
 
     **Jacobians.** One exact Jacobian is used for several corrections. Where there is no
     chord method, the approximate inverse of a small Jacobian is extrapolated from those of

@@ -61,6 +61,7 @@ class Powers(NamedTuple):
     - `moderate`: a residual above this is not round-off, however far from the origin the
       coordinates lie.
     - `tiny`: a residual below this is round-off if a new Jacobian does not reduce it.
+    - `elastic`: the same in the presence of stiff springs.
     - `round_off`: a residual below this is round-off if a Jacobian that has reduced it
       before no longer does. The largest residual of a long chain or beam is larger: forces
       are handed on from body to body, and their rounding errors with them.
@@ -72,6 +73,7 @@ class Powers(NamedTuple):
     small: float
     moderate: float
     tiny: float
+    elastic: float
     round_off: float
 
 
@@ -90,6 +92,7 @@ def powers_of(x: Float[Array, " n"]) -> Powers:
         small=eps**0.25,
         moderate=eps**0.5,
         tiny=eps**0.75,
+        elastic=eps**0.6875,
         round_off=min(eps**0.875 * growth, eps**0.75),
     )
 

@@ -194,6 +194,7 @@ def find_root(
             lambda y, inputs: prepare(inputs[2], y, inputs[1]),
             lambda value, inputs, prepared: correct(value, inputs[1], prepared),
             lambda y, inputs, prepared: effective(y, inputs[1], prepared),
+            chord.is_elastic,
         )
     inputs = traced, args, of_chord, regularisation
     return _root(call, chord, root_finder, inputs, start, max_iterations)

@@ -33,11 +33,14 @@ class Chord(NamedTuple):
       `prepared` is the result of `prepare`.
     - `effective(y, args, prepared)`: `y` without its part that the equations leave open;
       no correction has such a part.
+    - `is_elastic`: whether the equations may contain the forces of stiff springs, whose
+      round-off is large.
     """
 
     prepare: Callable[[PyTree[Array], Any], PyTree]
     correct: Callable[[PyTree[Array], Any, PyTree], PyTree[Array]]
     effective: Callable[[PyTree[Array], Any, PyTree], PyTree[Array]] = lambda y, *_: y
+    is_elastic: bool = False
 
 
 class Root(eqx.Module):
@@ -189,7 +192,9 @@ def _by_chord(
         correct = lambda x: leaves_of(chord.correct(unravel(x), args, prepared))
         return joined(correct(right))
 
-    search = lambda: chord_iterations(value, solve, newton, start, guess, patience)
+    search = lambda: chord_iterations(
+        value, solve, newton, start, guess, patience, chord.is_elastic
+    )
     last = part(search)()
     return Root(
         value=unravel(last.x),

@@ -12,7 +12,6 @@ from .._run.inputs import prepare
 from .._run.loop import dispensable_newton, Stepper
 from .._run.stage import (
     free_flight,
-    has_elastic_chord,
     is_chord_alone,
     owners_of,
     step_problem,
@@ -145,7 +144,7 @@ def _explained(
         solves=len(scheme.stages),
         unknowns=_unknowns(z),
         method=_BY_CHORD.format(newton) if by_chord else newton,
-        chord=_chord(scheme, model) if by_chord else None,
+        chord=_chord(model) if by_chord else None,
         jacobian=jacobian,
         obstacles=why_not_one_function(step, begin),
         operations=num_operations(
@@ -169,9 +168,8 @@ def _coordinates(model: AbstractModel, start: State) -> str:
     return model.kinematics.describe(start.q, start.v)
 
 
-def _chord(scheme: AbstractScheme, model: AbstractModel) -> str | None:
-    elastic = has_elastic_chord(scheme.stage)
-    if elastic and isinstance(model, SeparableModel) and model.elastic_tables is not None:
+def _chord(model: AbstractModel) -> str | None:
+    if isinstance(model, SeparableModel) and model.elastic_tables is not None:
         return model.elastic_tables.description
     tables = model.constraint_tables
     return None if tables is None else tables.description

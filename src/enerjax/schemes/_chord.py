@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._operators import DelassusMatrix, Increment
-from .._types import JointMultipliers, Scalar, Velocities
+from .._types import Scalar, Velocities
 from ._discontinuous import JumpAndEnd
 
 
@@ -125,13 +125,16 @@ def jump_chord(alpha: Scalar, rows: JumpAndEnd, delassus: DelassusMatrix) -> Jum
     after, before, *reactions = delassus.solve(jnp.stack(right))
     v1 = v1 - delassus.velocity(after)
     vj = vj + delassus.velocity(before) / 3
+    eta_1, eta_j = reactions if is_ggl else (end.velocity_impulse, jump.velocity_impulse)
     if delassus.elastic is not None:
-        v1, vj = velocities_with_strains(alpha, v1, vj, delassus)
-        change = _multipliers_of_strains(alpha, v1, vj, delassus)
+        none = jnp.zeros_like(v1)
+        slips = (none, none)
+        if is_ggl:
+            slips = delassus.velocity(eta_1), delassus.velocity(eta_j)
+        v1, vj, change = _with_strains(alpha, (v1, vj), slips, delassus)
         after, before = after + change[0], before + change[1]
     rate = 0.5 * (v1 + vj)
     jump_rate = (1 + alpha) * vj
-    eta_1, eta_j = reactions if is_ggl else (end.velocity_impulse, jump.velocity_impulse)
     if is_ggl:
         rate = rate + delassus.velocity(eta_1)
         jump_rate = jump_rate + 2 * delassus.velocity(eta_j)
@@ -153,24 +156,25 @@ def jump_chord(alpha: Scalar, rows: JumpAndEnd, delassus: DelassusMatrix) -> Jum
     )
 
 
-# The stiffness of strains adds `h^2 K` times these numbers to the balances of momentum of
-# the end and of the jump, whose unknowns are `v1` and `vj`:
+# With the stiffness of strains the balances of momentum of the end and of the jump (rows
+# of `A`) also contain `h^2 K A (v1, vj)`, where
 #
 #     A = [[1/6, 1/4 + alpha/12], [-(1/12 + alpha/36), -1/12 + alpha^2/36]]
 #
-# With `T = M^-1 h^2 K` the velocities are those without stiffness times
+# Let `T` be `h^2 M^-1 K`, restricted to motions that the joints permit. The velocities are
+# those without stiffness times
 #
 #     (I + T A)^-1 = (I + T adj A) / (1 + tr A T + det A T^2)
 #
-# whose denominator has complex roots. That of the chord method is `D = (1 + g T)^2`, with
-# `g = (1 + alpha)/12`, the root of `det A`. It is right for frequencies without stiffness
-# and for the highest ones; of those in between the difference is a part
+# The roots of this denominator are complex. The chord method has `D = (1 + g T)^2` in its
+# place, with `g = (1 + alpha)/12`, the root of `det A`. It is exact for motions without
+# stiffness and in the limit of high frequencies. In between the part
 #
-#     E = (2 g - tr A) T / D,   at most (g - tr A / 2)/(2 g) <= 1/3
+#     E = (2 g - tr A) T / D,   at most (g - tr A / 2)/(2 g) <= 1/3,
 #
-# so the inverse of the exact one is `(1 + E + E^2 + ...) / D`.
+# of `D` is too much, so the exact inverse is `(1 + E + E^2 + ...) / D`.
 
-# The number of terms of this sum: a correction leaves at most their power of a third.
+# The number of terms of this sum. A correction leaves at most (1/3)^3 of the error.
 _TERMS = 3
 
 
@@ -208,16 +212,40 @@ def velocities_with_strains(
     return v1, at_jump + (3 + alpha) / 36 * by_end + by_jump / 6
 
 
-def _multipliers_of_strains(
-    alpha: Scalar, v1: Velocities, vj: Velocities, delassus: DelassusMatrix
-) -> JointMultipliers:
-    """The change of the multipliers of the joints by the forces of the strains."""
-    share = (1 + alpha) / 12
-    end, jump = (delassus.elastic_force(v) / share for v in (v1, vj))
-    at_end = end / 6 + (3 + alpha) / 12 * jump
-    at_jump = (alpha**2 - 3) / 36 * jump - (3 + alpha) / 36 * end
-    moved = [delassus.product(delassus.inverse_inertia @ x) for x in (-at_end, 3 * at_jump)]
-    return delassus.solve(jnp.stack(moved))
+def _with_strains(
+    alpha: Scalar,
+    free: tuple[Velocities, Velocities],
+    slips: tuple[Velocities, Velocities],
+    delassus: DelassusMatrix,
+) -> tuple[Velocities, Velocities, Float[Array, "2 nc"]]:
+    """The velocities `v1` and `vj` with stiffness, and the change of the multipliers of the
+    joints by the forces of strains.
+
+    `free` are the velocities without stiffness, and `slips` those by which rates differ
+    from them, `M^-1 C^T eta_1` and `M^-1 C^T eta_j`.
+    """
+
+    def moved(v1: Velocities, vj: Velocities) -> tuple[Velocities, Velocities]:
+        """The velocities that strains cause at the end and at the jump."""
+        rate = 0.5 * (v1 + vj)
+        jump_rate = (alpha * vj - v1) / 6
+        return by_forces(rate, jump_rate)
+
+    def by_forces(rate: Velocities, jump_rate: Velocities) -> tuple[Velocities, Velocities]:
+        stiff = lambda x: 12 / (1 + alpha) * delassus.elastic_force(x)
+        end, jump = (delassus.inverse_inertia @ stiff(x) for x in (rate, jump_rate))
+        return 0.5 * (end + jump), (alpha * jump - end) / 6
+
+    by_slip = by_forces(slips[0], (slips[1] - slips[0]) / 3)
+    held = delassus.solve(jnp.stack([delassus.product(x) for x in by_slip]))
+    v1, vj = (
+        x - by + delassus.velocity(impulse)
+        for x, by, impulse in zip(free, by_slip, held, strict=True)
+    )
+    v1, vj = velocities_with_strains(alpha, v1, vj, delassus)
+    end, jump = (x + by for x, by in zip(moved(v1, vj), by_slip, strict=True))
+    right = jnp.stack([-delassus.product(end), 3 * delassus.product(jump)])
+    return v1, vj, delassus.solve(right)
 
 
 def skew_chord(rows: Increment, delassus: DelassusMatrix) -> Increment:
@@ -232,12 +260,13 @@ def skew_chord(rows: Increment, delassus: DelassusMatrix) -> Increment:
     if delassus.elastic is None or rows.momentum.size > 0:
         return step_chord(rows, delassus)
     inverse, slip = delassus.inverse_inertia, rows.velocity_impulse
-    free = 0.5 * (inverse @ rows.rate)
+    stiff = lambda velocity: 12 * delassus.elastic_force(velocity)
+    (own,) = delassus.solve((rows.impulse - 0.5 * slip)[None])
+    free = 0.5 * (inverse @ (rows.rate - stiff(delassus.velocity(own)) / 6))
     (held,) = delassus.solve((delassus.product(free) - rows.impulse)[None])
     none = jnp.zeros((), free.dtype)
     without = free - delassus.velocity(held)
     rate = _divided(none, without[None], delassus)[0][0]
-    stiff = lambda velocity: 12 * delassus.elastic_force(velocity)
     moved = inverse @ (stiff(rate) / 12)
     (eta,) = delassus.solve((rows.impulse - 0.5 * slip - delassus.product(moved))[None])
     v1 = 2 * (rate - moved - delassus.velocity(eta))

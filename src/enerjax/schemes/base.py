@@ -419,11 +419,11 @@ class AbstractSchemeWithMemory(AbstractOneSolveScheme[Z, P], Generic[Z, P]):
 class AbstractSchemeWithChord(AbstractOneSolveScheme[Z, P], Generic[Z, P]):
     """A scheme with an approximate Jacobian for the chord method.
 
-    The approximate Jacobian contains the inertia and the gradients of the constraints. It
-    differs from the exact one by terms of relative size `h^2` times stiffness divided by
-    inertia. Where these are small, the chord method with this matrix converges quickly, and
-    its linear systems have the Delassus matrix `B M^-1 B^T`. Where it fails, the exact
-    Jacobian is used.
+    The approximate Jacobian contains the inertia and the gradients of the constraints, and
+    if `has_elastic_chord` the stiffness of strains. It differs from the exact one by terms
+    of relative size `h^2` times the other stiffness divided by inertia. Where these are
+    small, the chord method with this matrix converges quickly, and its linear systems have
+    the Delassus matrix `B M^-1 B^T`. Where it fails, the exact Jacobian is used.
     """
 
     @property

@@ -229,9 +229,21 @@ class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
         h, alpha, inverse = step.h, self._alpha(step.h), delassus.inverse_inertia
         # The strains change with the position, which is predicted at the middle.
         middle = step.start.q + 0.5 * h * step.model.lift(step.start.q, step.start.v)
-        own = problem.row_scale * rows.strain_impulse
-        pushed, free = inverse @ strains.momentum(middle, own), inverse @ end.rate
-        slip = end.velocity_impulse
+        own, slip = problem.row_scale * rows.strain_impulse, end.velocity_impulse
+        right = (end.impulse - 0.5 * slip, rows.jump.velocity_impulse)
+        moving, jumping = map(delassus.velocity, delassus.solve(jnp.stack(right)))
+
+        def impulse_and_force(change: Array, strain: Array) -> tuple[Array, Velocities]:
+            impulse = h / 6 * strains.stresses(change - alpha * strain)
+            stress = strains.stresses(change + strain)
+            return impulse, strains.momentum(middle, h / 2 * stress)
+
+        # The part of the strains that the constraints of the velocities cause.
+        rates = lambda velocity: strains.rates(middle, velocity)
+        held = h * rates(moving), alpha * h / 6 * rates(jumping)
+        impulse, force = impulse_and_force(*held)
+        pushed = inverse @ strains.momentum(middle, own + impulse)
+        free = inverse @ (end.rate - force)
         right = (delassus.product(pushed), delassus.product(free) - slip)
         at_jump, at_end = delassus.solve(jnp.stack(right))
         v1, jump = velocities_with_strains(
@@ -240,22 +252,21 @@ class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
             pushed - delassus.velocity(at_jump),
             delassus,
         )
-        change = h / 2 * strains.rates(middle, v1 + jump)
-        strain = -h / 6 * strains.rates(middle, v1 - alpha * jump)
-        impulse = own + h / 6 * strains.stresses(change - alpha * strain)
-        force = strains.momentum(middle, h / 2 * strains.stresses(change + strain))
+        change = held[0] + h / 2 * rates(v1 + jump)
+        strain = held[1] - h / 6 * rates(v1 - alpha * jump)
+        impulse, force = impulse_and_force(change, strain)
+        impulse = own + impulse
         moved = delassus.product(inverse @ strains.momentum(middle, impulse))
         reactions = (
             delassus.product(inverse @ (end.rate - force)) - slip,
             moved - rows.jump.velocity_impulse,
             end.impulse - 0.5 * (slip + moved),
-            end.impulse - 0.5 * slip,
         )
-        multipliers, at_start, reaction, moving = delassus.solve(jnp.stack(reactions))
+        multipliers, at_start, reaction = delassus.solve(jnp.stack(reactions))
         found = eqx.tree_at(
             lambda z: (z.impulse, z.rate, z.velocity_impulse),
             end,
-            (multipliers, 0.5 * (v1 + jump) + delassus.velocity(moving), reaction),
+            (multipliers, 0.5 * (v1 + jump) + moving, reaction),
         )
         return _correction(problem, rows, impulse, at_start, found)
 

@@ -9,6 +9,7 @@ redundant, so the elimination needs no pivoting.
 """
 
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -33,6 +34,15 @@ from .graph_elimination import elimination_order, Factors, GraphElimination, Ord
 _FEW = 8
 # The largest number of rows of a block. Larger blocks would be eliminated too slowly.
 _WIDEST = 64
+
+
+class Bounds(NamedTuple):
+    """Largest numbers: of blocks of `W` in which a row has entries, of rows that have
+    entries in the same block, and of rounds of the elimination."""
+
+    blocks: int
+    rows: int
+    rounds: int
 
 
 class SchurTables(Indices):
@@ -142,7 +152,12 @@ class _Segments:
         within = np.arange(incidence.nnz) - np.repeat(incidence.indptr[:-1], counts)
         self.touched = np.full((num_rows, max(counts.max(initial=0), 1)), count)
         self.touched[np.repeat(np.arange(num_rows), counts), within] = incidence.indices
-        self._coupling = scipy.sparse.csr_array(incidence @ incidence.T)
+        self._incidence = incidence
+
+    def are_within(self, bounds: Bounds) -> bool:
+        """Whether rows and blocks are; the rounds are not known yet."""
+        most_rows = np.bincount(self._incidence.indices).max(initial=0)
+        return self.touched.shape[1] <= bounds.blocks and most_rows <= bounds.rows
 
     def orders(self, most_rounds: float) -> Iterator[Order | None]:
         """By the nodes of rows that act on the same bodies, and by the blocks of a band.
@@ -150,7 +165,7 @@ class _Segments:
         The graph of a net has no small separators, but it is a band. Its blocks are large,
         so this is not an order with few rounds.
         """
-        coupling = self._coupling
+        coupling = scipy.sparse.csr_array(self._incidence @ self._incidence.T)
         labels = np.unique(self.touched, axis=0, return_inverse=True)[1]
         yield _order(labels, coupling, most_rounds)
         if most_rounds < np.inf:
@@ -236,13 +251,12 @@ def schur_tables(
     like: Float[Array, " n"],
     weight: Symmetric,
     colours: np.ndarray | None = None,
-    most_rounds: float = np.inf,
+    bounds: Bounds | None = None,
 ) -> SchurTables | None:
     """The tables for the Jacobian of `fn`.
 
     The `colours` of its columns are found, unless those of a Jacobian with more rows are
-    given. `None` if it has no rows, too large blocks, or needs more rounds of elimination
-    than `most_rounds`.
+    given. `None` if it has no rows or too large blocks, or is not within the `bounds`.
     """
     num_rows = jax.eval_shape(fn, like).shape[0]
     pattern = jacobian_pattern(fn, like) if like.size > _FEW else None
@@ -252,6 +266,9 @@ def schur_tables(
         pattern = np.ones((num_rows, like.size), bool)
     pattern = scipy.sparse.csr_array(pattern)
     segments = _Segments(pattern, weight)
+    if bounds is not None and not segments.are_within(bounds):
+        return None
+    most_rounds = np.inf if bounds is None else bounds.rounds
     orders = [x for x in segments.orders(most_rounds) if x is not None]
     order = min(orders, key=lambda x: x.cost, default=None)
     if order is None or order.width > _WIDEST:
