@@ -4,8 +4,10 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 import pytest
+import space_mechanisms as space
 from scipy.integrate import solve_ivp
 
 import enerjax as ej
@@ -387,3 +389,17 @@ def test_modes_of_an_over_constrained_scene():
     assert float(slope) == pytest.approx(0.5 / np.sqrt(G), rel=1e-12)
     with pytest.raises(ValueError, match="depends on its pose"):
         jax.jit(first)(G)
+
+
+@pytest.mark.slow
+def test_newton_finds_the_step_of_redundant_joints_beside_stiff_springs():
+    """The step back to multipliers of least norm must not leave the root."""
+    loop = space.with_springs(space.bricard(), 1e7)
+    system, start, args = loop.scene().build()
+    newton = ej.Newton(linear_solver=lx.LU())
+    sol = ej.simulate(
+        system, ej.EnergyPreserving(), start, args, h=0.01, num_steps=10, root_finder=newton
+    )
+    # Round-off of the energies, about 10 J, and of the positions.
+    assert jnp.max(jnp.abs(sol.audit.leak)) <= 1e3 * EPS
+    assert jnp.max(jnp.abs(sol.audit.constraint)) <= 100 * EPS

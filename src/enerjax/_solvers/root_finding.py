@@ -17,7 +17,7 @@ from .chord_iterations import chord_iterations, PATIENCE, PATIENCE_ALONE
 from .linear.dense import AbstractFactors, Inverse, SMALL
 from .linear.jacobian import Linearisable, linearisable
 from .newton import ChordAlone, Newton, Start
-from .newton_iterations import max_norm, newton_iterations
+from .newton_iterations import max_norm, newton_iterations, powers_of
 
 
 RootFinder = TypeAliasType(
@@ -215,9 +215,12 @@ def _iterated(
     last = newton_iterations(residual, newton, start, max_jacobians)
     x = last.x
     if residual.regularisation is not None:
-        x = jnp.where(
-            last.done & ~start.skip, _least_norm_root(residual, last.factors, x), x
-        )
+        closed = _least_norm_root(residual, last.factors, x)
+        # Beside stiff forces the matrix of redundant rows is so ill-conditioned that
+        # `closed` may be no root. The multipliers of `x` cause the same forces.
+        left, before = (max_norm(residual.value(y)) for y in (closed, x))
+        is_root = left <= jnp.maximum(before, powers_of(x).round_off)
+        x = jnp.where(last.done & ~start.skip & is_root, closed, x)
     keeps = residual.keeps_factors and start.factors is not None
     factors = last.factors if keeps else start.factors
     return Root(
