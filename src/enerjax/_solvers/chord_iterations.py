@@ -91,10 +91,8 @@ def chord_iterations(
         done = done | (~shrinks & (defect <= powers.round_off) & (size <= powers.small))
         stalls = ~shrinks & ~(contraction * before.contraction < _SHRINKS**2)
         # So is a larger one, if corrections have reduced it and two in a row no longer do:
-        # the inertia of an arm is ill-conditioned, and its rates have few exact digits. The
-        # forces of stiff springs have fewer, because positions are rounded.
-        floor = powers.elastic if is_elastic else powers.tiny
-        is_floor = stalls & before.has_shrunk & (defect <= floor)
+        # the inertia of an arm is ill-conditioned, and its rates have few exact digits.
+        is_floor = stalls & before.has_shrunk & (defect <= powers.of_chord(is_elastic))
         # The corrections of singular equations do not show rows that contradict each other,
         # so a small correction proves nothing there.
         if start.regularisation is None:

@@ -61,7 +61,7 @@ class Powers(NamedTuple):
     - `moderate`: a residual above this is not round-off, however far from the origin the
       coordinates lie.
     - `tiny`: a residual below this is round-off if a new Jacobian does not reduce it.
-    - `elastic`: the same in the presence of stiff springs.
+    - `elastic`: the same beside stiff springs, which turn round-off of positions to forces.
     - `round_off`: a residual below this is round-off if a Jacobian that has reduced it
       before no longer does. The largest residual of a long chain or beam is larger: forces
       are handed on from body to body, and their rounding errors with them.
@@ -75,6 +75,9 @@ class Powers(NamedTuple):
     tiny: float
     elastic: float
     round_off: float
+
+    def of_chord(self, is_elastic: bool) -> float:
+        return self.elastic if is_elastic else self.tiny
 
 
 # Up to this number of unknowns the threshold of round-off is that of a single body.

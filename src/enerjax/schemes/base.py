@@ -427,10 +427,10 @@ class AbstractSchemeWithChord(AbstractOneSolveScheme[Z, P], Generic[Z, P]):
     """
 
     @property
+    @abc.abstractmethod
     def has_elastic_chord(self) -> bool:
         """Whether the approximate Jacobian also contains the stiffness of strains, so that
         stiff springs and beams do not slow its convergence."""
-        return False
 
     @abc.abstractmethod
     def delassus_matrix(self, z: Z, problem: P) -> DelassusMatrix:

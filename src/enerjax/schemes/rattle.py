@@ -62,6 +62,10 @@ class Rattle(AbstractSchemeWithChord[Increment, StepProblem]):
         balance = problem.separable_model.inertia @ (middle - start.v) + 0.5 * pulled
         return problem.rows_of_balance(z, balance, self._end(z, problem))
 
+    @property
+    def has_elastic_chord(self) -> bool:
+        return False
+
     def delassus_matrix(self, z: Increment, problem: StepProblem) -> DelassusMatrix:
         return problem.delassus_matrix(z)
 
