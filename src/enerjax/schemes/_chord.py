@@ -94,7 +94,7 @@ def jump_chord(alpha: Scalar, rows: JumpAndEnd, delassus: DelassusMatrix) -> Jum
         (1 + alpha) vj = 2 rate_1 + 6 rate_j - 2 M^-1 C^T eta_j
 
     It solves `M v1 + C^T impulse_1 = r_1` and `M vj - C^T (impulse_1 - impulse_j)/3 = r_j`,
-    with the rows of the constraints at both nodes.
+    and the rows of the constraints at both nodes; with strains see below.
     """
     if rows.end.momentum.size > 0:
         shifted = JumpAndEnd(
@@ -225,25 +225,21 @@ def _with_strains(
     from them, `M^-1 C^T eta_1` and `M^-1 C^T eta_j`.
     """
 
-    def moved(v1: Velocities, vj: Velocities) -> tuple[Velocities, Velocities]:
-        """The velocities that strains cause at the end and at the jump."""
-        rate = 0.5 * (v1 + vj)
-        jump_rate = (alpha * vj - v1) / 6
-        return by_forces(rate, jump_rate)
-
-    def by_forces(rate: Velocities, jump_rate: Velocities) -> tuple[Velocities, Velocities]:
+    def slowed(rate: Velocities, jump_rate: Velocities) -> tuple[Velocities, Velocities]:
+        """What the strains of these rates take from the velocities of both nodes."""
         stiff = lambda x: 12 / (1 + alpha) * delassus.elastic_force(x)
         end, jump = (delassus.inverse_inertia @ stiff(x) for x in (rate, jump_rate))
         return 0.5 * (end + jump), (alpha * jump - end) / 6
 
-    by_slip = by_forces(slips[0], (slips[1] - slips[0]) / 3)
+    of_slips = slips[0], (slips[1] - slips[0]) / 3
+    by_slip = slowed(*of_slips)
     held = delassus.solve(jnp.stack([delassus.product(x) for x in by_slip]))
     v1, vj = (
         x - by + delassus.velocity(impulse)
         for x, by, impulse in zip(free, by_slip, held, strict=True)
     )
     v1, vj = velocities_with_strains(alpha, v1, vj, delassus)
-    end, jump = (x + by for x, by in zip(moved(v1, vj), by_slip, strict=True))
+    end, jump = slowed(0.5 * (v1 + vj) + of_slips[0], (alpha * vj - v1) / 6 + of_slips[1])
     right = jnp.stack([-delassus.product(end), 3 * delassus.product(jump)])
     return v1, vj, delassus.solve(right)
 
