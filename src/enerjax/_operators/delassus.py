@@ -39,7 +39,7 @@ class DelassusMatrix(eqx.Module):
     - `regularisation`: the diagonal matrix `E` that has been added to `G` before it was
       factorised, where joints may be redundant; else `None`.
     - `elastic`: the same as `schur` with the rows of strains behind those of the joints;
-      see `elastic.py`. `None` where stiffness is left out.
+      see `elastic.py`. `None` where stiffness is omitted.
     """
 
     inverse_inertia: Symmetric
@@ -95,10 +95,8 @@ class DelassusMatrix(eqx.Module):
             impulse, *found = self.solve(jnp.stack([self.product(free) - rates, *others]))
             return impulse, free - self.velocity(impulse), tuple(found)
         found = self.solve(jnp.stack(others)) if others else ()
-        right = self.elastic.product(free)
-        right = right.at[: rates.size].add(-rates)
-        both = self._solve(self.elastic, right[None])[0]
-        velocity = free - self.inverse_inertia @ self.elastic.transposed(both)
+        right = self.elastic.product(free).at[: rates.size].add(-rates)
+        (both,), (velocity,) = self._beside_strains(self.elastic, right[None], free[None])
         return both[: rates.size], velocity, tuple(found)
 
     def softened(self, free: Float[Array, "k nv"]) -> Float[Array, "k nv"]:
@@ -106,21 +104,30 @@ class DelassusMatrix(eqx.Module):
 
         (M + S^T S) u + C^T x = M free,   C u = C free
         """
-        if self.elastic is None:
-            return free
-        num_joints = 0 if self.schur is None else self.schur.tables.num_rows
-        right = jax.vmap(self.elastic.product)(free).at[:, :num_joints].set(0)
-        both = self._solve(self.elastic, right)
-        pulled = jax.vmap(self.elastic.transposed)(both)
-        return free - jax.vmap(self.inverse_inertia.__matmul__)(pulled)
+        assert self.elastic is not None
+        return self._beside_strains(self.elastic, jax.vmap(self._strain_rates)(free), free)[
+            1
+        ]
 
     def elastic_force(self, velocity: Velocities) -> Velocities:
         """`S^T S velocity`"""
-        if self.elastic is None:
-            return jnp.zeros_like(velocity)
-        strains = self.elastic.product(velocity)
-        num_joints = 0 if self.schur is None else self.schur.tables.num_rows
-        return self.elastic.transposed(strains.at[:num_joints].set(0))
+        assert self.elastic is not None
+        return self.elastic.transposed(self._strain_rates(velocity))
+
+    def _strain_rates(self, velocity: Velocities) -> Float[Array, " n"]:
+        """`S velocity`, behind zeros for the joints."""
+        assert self.elastic is not None
+        assert self.schur is not None
+        num_joints = self.schur.tables.num_rows
+        return self.elastic.product(velocity).at[:num_joints].set(0)
+
+    def _beside_strains(
+        self, elastic: Schur, right: Float[Array, "k n"], free: Float[Array, "k nv"]
+    ) -> tuple[Float[Array, "k n"], Float[Array, "k nv"]]:
+        """The multipliers of joints and strains, and the velocities that they leave."""
+        both = self._solve(elastic, right)
+        pulled = jax.vmap(elastic.transposed)(both)
+        return both, free - jax.vmap(self.inverse_inertia.__matmul__)(pulled)
 
     def effective(self, multipliers: Multipliers) -> Multipliers:
         """Multipliers of the joints without their part in the null space of `G`.

@@ -74,7 +74,7 @@ class ElasticTables(NamedTuple):
 def elastic_tables(
     rates: Rates, num_joints: int, rest: Velocities, weight: Symmetric
 ) -> ElasticTables | None:
-    """The tables for `rates`; `None` if the elimination would be long, as that of a net."""
+    """The tables for `rates`; `None` where the elimination is long, like that of a net."""
     both = schur_tables(rates, rest, weight, bounds=_BOUNDS)
     if both is None:
         return None

@@ -92,7 +92,7 @@ def chord_iterations(
         stalls = ~shrinks & ~(contraction * before.contraction < _SHRINKS**2)
         # So is a larger one, if corrections have reduced it and two in a row no longer do:
         # the inertia of an arm is ill-conditioned, and its rates have few exact digits.
-        is_floor = stalls & before.has_shrunk & (defect <= powers.of_chord(is_elastic))
+        is_floor = stalls & before.has_shrunk & (defect <= powers.stalled(is_elastic))
         # The corrections of singular equations do not show rows that contradict each other,
         # so a small correction proves nothing there.
         if start.regularisation is None:

@@ -76,7 +76,8 @@ class Powers(NamedTuple):
     elastic: float
     round_off: float
 
-    def of_chord(self, is_elastic: bool) -> float:
+    def stalled(self, is_elastic: bool) -> float:
+        """A residual below this is round-off if chord corrections no longer reduce it."""
         return self.elastic if is_elastic else self.tiny
 
 

@@ -126,18 +126,15 @@ def jump_chord(alpha: Scalar, rows: JumpAndEnd, delassus: DelassusMatrix) -> Jum
     v1 = v1 - delassus.velocity(after)
     vj = vj + delassus.velocity(before) / 3
     eta_1, eta_j = reactions if is_ggl else (end.velocity_impulse, jump.velocity_impulse)
+    none = jnp.zeros_like(v1)
+    slips = none, none
+    if is_ggl:
+        slips = delassus.velocity(eta_1), delassus.velocity(eta_j)
     if delassus.elastic is not None:
-        none = jnp.zeros_like(v1)
-        slips = (none, none)
-        if is_ggl:
-            slips = delassus.velocity(eta_1), delassus.velocity(eta_j)
         v1, vj, change = _with_strains(alpha, (v1, vj), slips, delassus)
         after, before = after + change[0], before + change[1]
-    rate = 0.5 * (v1 + vj)
-    jump_rate = (1 + alpha) * vj
-    if is_ggl:
-        rate = rate + delassus.velocity(eta_1)
-        jump_rate = jump_rate + 2 * delassus.velocity(eta_j)
+    rate = 0.5 * (v1 + vj) + slips[0]
+    jump_rate = (1 + alpha) * vj + 2 * slips[1]
     relations = of_end.normal - delassus.normal_forces(after)
     difference = -3 * of_jump.normal - delassus.normal_forces(before)
     return JumpAndEnd(

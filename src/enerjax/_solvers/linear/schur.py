@@ -75,7 +75,10 @@ class SchurTables(Indices):
         self.num_rows, size = shape_of(pattern)
         rows, columns = pattern.nonzero()
         blocks = segments.blocks
-        super().__init__(np.concatenate([rows, columns, blocks.ravel(), blocks.shape]))
+        # Equal rows can have other colours, or another order of elimination.
+        eliminated = [node for of in order.rounds for node in (*of.nodes, -1)]
+        content = rows, columns, blocks.ravel(), blocks.shape, colours, eliminated
+        super().__init__(np.concatenate(content).astype(int))
         self.colours = colours
         self.touched = segments.touched
         none = np.full((1, blocks.shape[1]), size)
@@ -155,7 +158,7 @@ class _Segments:
         self._incidence = incidence
 
     def are_within(self, bounds: Bounds) -> bool:
-        """Whether rows and blocks are; the rounds are not known yet."""
+        """Whether the numbers of blocks and of rows are; the rounds are not known yet."""
         most_rows = np.bincount(self._incidence.indices).max(initial=0)
         return self.touched.shape[1] <= bounds.blocks and most_rows <= bounds.rows
 
