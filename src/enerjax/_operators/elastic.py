@@ -19,7 +19,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._programs import call_traced_once, squares_in
-from .._solvers import Bounds, Schur, schur, schur_tables, SchurTables, Symmetric
+from .._solvers import (
+    Bounds,
+    diagonal_of,
+    Schur,
+    schur,
+    schur_tables,
+    SchurTables,
+    Symmetric,
+)
 from .._system import AbstractStrainEnergy
 from .._types import Args, Coordinates, JointMultipliers, Scalar, Velocities
 
@@ -166,7 +174,7 @@ def _root(matrices: Float[Array, "elements m m"]) -> Float[Array, "elements m m"
     """The lower Cholesky factors `R^T`, without the columns whose pivot is not positive, or
     so small that it is round-off."""
     size = matrices.shape[-1]
-    least = _LEAST_PIVOT * jnp.max(jnp.diagonal(matrices, axis1=1, axis2=2), axis=1)
+    least = _LEAST_PIVOT * jnp.max(diagonal_of(matrices), axis=1)
     columns, rest = [], matrices
     for k in range(size):
         pivot = rest[:, k, k]

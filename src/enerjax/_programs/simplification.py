@@ -17,11 +17,7 @@ from jaxtyping import Array, PyTree
 
 from .compiled import is_hashable
 from .jaxprs import evaluate, interpret, known_numbers
-from .numpy_primitives import evaluated
-
-
-# Constants with more numbers than this are not compared.
-_MANY = 4096
+from .known_indices import computed_indices, MANY
 
 
 def simplified(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Array]]:
@@ -51,7 +47,7 @@ def _shared(constants: list[Any]) -> list[Any]:
 
 def _content(constant: Any) -> Any:
     """Equal for arrays of equal numbers; the identity of a traced or a large array."""
-    array = known_numbers(constant) if np.size(constant) <= _MANY else None
+    array = known_numbers(constant) if np.size(constant) <= MANY else None
     if array is None:
         return id(constant)
     return array.tobytes(), array.shape, array.dtype, jnp.asarray(constant).weak_type
@@ -85,7 +81,7 @@ class _Once:
         if id(equation) not in self._needed:
             return [None] * len(equation.outvars)
         primitive, params = equation.primitive, equation.params
-        indices = _indices(equation, values)
+        indices = computed_indices(equation, values)
         if indices is not None:
             content = lambda x: (x.tobytes(), x.shape, x.dtype)
             return [self._indices.setdefault(content(x), x) for x in indices]
@@ -95,24 +91,6 @@ class _Once:
         if key not in self._found:
             self._found[key] = evaluate(primitive, values, params), values
         return self._found[key][0]
-
-
-def _indices(equation: Any, values: list[Any]) -> list[Any] | None:
-    """The outputs of an equation that computes indices, if its inputs are known."""
-    avals = [x.aval for x in equation.outvars]
-    if any(not _is_index(x) or x.size > _MANY for x in avals):
-        return None
-    known = [known_numbers(x) for x in values]
-    # NumPy rounds numbers to indices in another way than XLA.
-    if equation.effects or any(x is None or not _is_index(x) for x in known):
-        return None
-    with jax.ensure_compile_time_eval():
-        out = evaluated(equation.primitive, known, equation.params)
-    return [np.asarray(x, aval.dtype) for x, aval in zip(out, avals, strict=True)]
-
-
-def _is_index(x: Any) -> bool:
-    return getattr(x.dtype, "kind", "key") in "iub"
 
 
 def _identity(value: Any) -> Any:

@@ -5,6 +5,7 @@ from .linear.block_diagonal import (
     as_dense as as_dense,
     BlockDiagonal as BlockDiagonal,
     blocks_of as blocks_of,
+    diagonal_of as diagonal_of,
     hessian as hessian,
     in_blocks as in_blocks,
     inverse_of as inverse_of,

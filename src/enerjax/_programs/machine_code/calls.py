@@ -7,7 +7,7 @@ of this kind too; `jax.checkpoint` decides which values they keep.
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextvars import ContextVar
 from typing import Any, ParamSpec, TypeVar
 
@@ -15,12 +15,13 @@ import jax
 import jax.numpy as jnp
 import jaxlib
 import numpy as np
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, Primitive
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, Literal, Primitive
 from jax.interpreters import ad, batching, mlir
 from jax.interpreters.partial_eval import dce_jaxpr_consts
 from jaxtyping import Array, PyTree
 
 from ..jaxprs import known_numbers, with_constants_as_inputs
+from ..known_indices import known_indices
 from .evaluation import NAME
 from .library import compiled_function, Function, graph_of
 from .values import Unsupported
@@ -144,9 +145,12 @@ class Program:
 
     def __call__(self, numbers: Sequence[Array]) -> list[Array]:
         """The outputs, computed by operations of JAX."""
+        return jaxpr_as_fun(ClosedJaxpr(self.jaxpr, ()))(*self.filled(numbers))
+
+    def filled(self, numbers: Sequence[Any]) -> list[Any]:
+        """The inputs, with the values of those that are known."""
         pairs = zip(numbers, self.known, strict=True)
-        values = [x if known is None else known for x, known in pairs]
-        return jaxpr_as_fun(ClosedJaxpr(self.jaxpr, ()))(*values)
+        return [x if known is None else known for x, known in pairs]
 
     def run(self, numbers: Sequence[Array]) -> list[Array]:
         """The outputs, computed by machine code where that is possible."""
@@ -175,6 +179,7 @@ def run_closed(
     numbers = [*closed.consts, *inputs]
     variables = (*closed.jaxpr.constvars, *closed.jaxpr.invars)
     inputs_by_id = {id(x): number for x, number in zip(variables, numbers, strict=True)}
+    inputs_by_id |= _tables(closed.jaxpr, zip(variables, numbers, strict=True))
     handed_through = [id(x) in inputs_by_id for x in closed.jaxpr.outvars]
     computed = [on and not same for on, same in zip(wanted, handed_through, strict=True)]
     out = []
@@ -196,6 +201,16 @@ def run_closed(
     _, asked = _split(computed, wanted)
     pairs = zip(variables, asked, strict=True)
     return _merged(computed, out, [inputs_by_id[id(x)] if on else None for x, on in pairs])
+
+
+def _tables(jaxpr: Any, inputs: Iterable[tuple[Any, Any]]) -> dict[int, np.ndarray]:
+    """The outputs that are tables of indices with known values, by their identities."""
+    outputs = [x for x in jaxpr.outvars if not isinstance(x, Literal)]
+    if not any(x.aval.ndim and x.aval.dtype.kind in "iu" for x in outputs):
+        return {}
+    places = {variable: _known_places(x) for variable, x in inputs}
+    known = known_indices(jaxpr, {v: x for v, x in places.items() if x is not None})
+    return {id(x): known[x] for x in outputs if x in known}
 
 
 def _known_places(x: Any) -> np.ndarray | None:
@@ -241,6 +256,7 @@ def _jvp(primals: Any, tangents: Any, *, program: Program) -> tuple[list, list]:
         values = lambda *own: _split(smooth, program(_merged(has_tangent, own, still)))
         return jax.linearize(values, *own, has_aux=True)
 
+    primals = program.filled(primals)
     closed, like = jax.make_jaxpr(linearised, return_shape=True)(*primals)
     pushed = jax.make_jaxpr(lambda push, moved: push(*moved))(like[1], moved)
     depends = _depends(pushed, len(moved))
@@ -270,7 +286,8 @@ def _depends(closed: ClosedJaxpr, linear: int) -> list[bool]:
 
 def _transpose(cotangents: Any, *numbers: Any, program: Program) -> list:
     wanted = [ad.is_undefined_primal(x) for x in numbers]
-    unknown, known = _split(wanted, numbers)
+    # JAX hands index tables from the program to its transpose as numbers like others.
+    unknown, known = _split(wanted, program.filled(numbers))
     has_cotangent = [not isinstance(ct, ad.Zero) for ct in cotangents]
     cotangents, _ = _split(has_cotangent, cotangents)
 

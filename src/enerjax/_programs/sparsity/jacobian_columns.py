@@ -25,6 +25,8 @@ from ..primitives import ARITHMETIC, JIT
 
 # Tables of nonzero entries with more truth values than this are not computed.
 _LARGEST_TABLE = 2**15
+# So few columns are evaluated together, and a program of its own has this number at least.
+_FEW, _LEAST = 32, 8
 # Primitives that are applied to columns as they are applied to the array itself.
 _IN_COLUMNS = ARITHMETIC | {"copy"}
 
@@ -68,12 +70,17 @@ def _apart(seeds: Float[np.ndarray, "n k"]) -> list[Float[np.ndarray, "n part"]]
     """The columns, divided where one has no entries in the range of those before it.
 
     In the program for multipliers alone the tangents of all coordinates are known zeros.
+    Each part is a program of its own, so parts of few columns are not divided.
     """
-    size, cuts, low, high = len(seeds), [], len(seeds), 0
+    size, count = seeds.shape
+    if count <= _FEW:
+        return [seeds]
+    least = max(_LEAST, count // _LEAST)
+    cuts, first, low, high = [], 0, size, 0
     for k, column in enumerate(seeds.T != 0):
-        if k and not np.any(column[low:high]):
+        if least <= k - first and k <= count - least and not np.any(column[low:high]):
             cuts.append(k)
-            low, high = size, 0
+            first, low, high = k, size, 0
         low = min(low, int(np.argmax(column)))
         high = max(high, size - int(np.argmax(column[::-1])))
     return np.split(seeds, cuts, axis=1)

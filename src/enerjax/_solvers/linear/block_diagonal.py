@@ -85,7 +85,7 @@ class BlockDiagonal(eqx.Module):
         return jnp.where(self.places.coupled, blocks, 0)
 
     def diagonal(self) -> Float[Array, " n"]:
-        diagonals = jnp.diagonal(self.blocks, axis1=1, axis2=2)
+        diagonals = diagonal_of(self.blocks)
         return at_places(diagonals.ravel(), self.places.back)
 
 
@@ -102,7 +102,7 @@ def inverse_of(matrix: Symmetric) -> Symmetric:
 def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     # Scaled to a unit diagonal first, so that diagonal matrices are inverted without
     # rounding errors, whatever the ratios of their entries are.
-    root = jnp.sqrt(jnp.diagonal(matrix))
+    root = jnp.sqrt(diagonal_of(matrix))
     scale = jnp.outer(root, root)
     return jnp.linalg.inv(matrix / scale) / scale
 
@@ -132,6 +132,16 @@ def as_dense(matrix: Symmetric) -> Float[Array, "n n"]:
     return jax.vmap(matrix.__matmul__)(jnp.eye(matrix.shape[0], dtype=matrix.dtype))
 
 
+def diagonal_of(matrices: Float[Array, "... n n"]) -> Float[Array, "... n"]:
+    """The entries on the diagonals.
+
+    `jax.numpy.diagonal` has a branch for some processors, in which the derivative of a
+    program loses the places of the entries.
+    """
+    places = np.arange(matrices.shape[-1])
+    return matrices[..., places, places]
+
+
 def blocks_of(matrix: Symmetric) -> Float[Array, "blocks size size"]:
     """The blocks along the diagonal; a plain array is one block."""
     return matrix.blocks if isinstance(matrix, BlockDiagonal) else matrix[None]
@@ -140,7 +150,7 @@ def blocks_of(matrix: Symmetric) -> Float[Array, "blocks size size"]:
 def scaled_blocks(matrix: Symmetric) -> Float[Array, "blocks size size"]:
     """The blocks of a matrix, with ones on the diagonal where that is positive."""
     blocks = blocks_of(matrix)
-    masses = jnp.diagonal(blocks, axis1=1, axis2=2)
+    masses = diagonal_of(blocks)
     largest = jnp.max(jnp.abs(masses))
     root = jnp.sqrt(jnp.where(masses > 0, masses, jnp.where(largest > 0, largest, 1)))
     return blocks / (root[:, :, None] * root[:, None, :])
@@ -157,7 +167,7 @@ def is_positive_definite(
         rows = np.arange(margins.size)[None] if is_array else matrix.places.rows
         added = np.append(margins, 0)[rows][:, :, None] * np.eye(rows.shape[1])
         blocks = blocks + jnp.asarray(added, matrix.dtype)
-    is_positive = jnp.diagonal(blocks, axis1=1, axis2=2) > 0
+    is_positive = diagonal_of(blocks) > 0
     return jnp.all(is_positive) & jnp.all(jnp.isfinite(jnp.linalg.cholesky(blocks)))
 
 

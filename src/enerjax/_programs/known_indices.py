@@ -1,0 +1,48 @@
+"""Indices whose values follow from the program, before it runs."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import Literal
+
+from .jaxprs import known_numbers
+from .numpy_primitives import evaluated
+
+
+# Arrays with more numbers than this are neither computed nor compared.
+MANY = 2**17
+
+
+def known_indices(jaxpr: Any, inputs: dict[Any, np.ndarray]) -> dict[Any, np.ndarray]:
+    """The variables that hold indices, and their values, where `inputs` determine them."""
+    known = dict(inputs)
+    for eqn in jaxpr.eqns:
+        values = [
+            np.asarray(x.val, x.aval.dtype) if isinstance(x, Literal) else known.get(x)
+            for x in eqn.invars
+        ]
+        if any(x is None for x in values):
+            continue
+        indices = computed_indices(eqn, values)
+        if indices is not None:
+            known.update(zip(eqn.outvars, indices, strict=True))
+    return known
+
+
+def computed_indices(equation: Any, values: list[Any]) -> list[Any] | None:
+    """The outputs of an equation that computes indices, if its inputs are known."""
+    avals = [x.aval for x in equation.outvars]
+    if any(not _is_index(x) or x.size > MANY for x in avals):
+        return None
+    known = [known_numbers(x) for x in values]
+    # NumPy rounds numbers to indices in another way than XLA.
+    if equation.effects or any(x is None or not _is_index(x) for x in known):
+        return None
+    with jax.ensure_compile_time_eval():
+        out = evaluated(equation.primitive, known, equation.params)
+    return [np.asarray(x, aval.dtype) for x, aval in zip(out, avals, strict=True)]
+
+
+def _is_index(x: Any) -> bool:
+    return getattr(x.dtype, "kind", "key") in "iub"
