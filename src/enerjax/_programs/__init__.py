@@ -35,8 +35,8 @@ from .machine_code import (
 from .places import at_places as at_places, with_any as with_any
 from .simplification import simplified as simplified
 from .sparsity.jacobian_columns import (
-    batched_columns as batched_columns,
     columns_along as columns_along,
+    columns_in_turn as columns_in_turn,
     jacobian_columns as jacobian_columns,
 )
 from .sparsity.pattern import (

@@ -25,8 +25,6 @@ from ..primitives import ARITHMETIC, JIT
 
 # Tables of nonzero entries with more truth values than this are not computed.
 _LARGEST_TABLE = 2**15
-# So few columns are evaluated together, and a program of its own has this number at least.
-_FEW, _LEAST = 32, 8
 # Primitives that are applied to columns as they are applied to the array itself.
 _IN_COLUMNS = ARITHMETIC | {"copy"}
 
@@ -51,39 +49,21 @@ def jacobian_columns(
     return columns_along(fn, x, np.eye(x.size))
 
 
-def batched_columns(
+def columns_in_turn(
     fn: Callable[[Array], Array], x: Float[Array, " n"], seeds: Float[np.ndarray, "n k"]
 ) -> Float[Array, "... k"]:
-    """The same derivatives as `columns_along`, with `jax.vmap`.
+    """The same derivatives as `columns_along`, one column after the other.
 
-    They take longer to compute, but their program is compiled several times as fast.
+    The program has a single product, so that it is compiled many times as fast. It computes
+    entries that are zero, but its code stays in the cache of the processor: for large
+    systems it takes no longer.
     """
     _, push = jax.linearize(fn, x)
-    products = [
-        jax.vmap(push, in_axes=1, out_axes=-1)(jnp.asarray(part, x.dtype))
-        for part in _apart(seeds)
-    ]
-    return products[0] if len(products) == 1 else jnp.concatenate(products, axis=-1)
-
-
-def _apart(seeds: Float[np.ndarray, "n k"]) -> list[Float[np.ndarray, "n part"]]:
-    """The columns, divided where one has no entries in the range of those before it.
-
-    In the program for multipliers alone the tangents of all coordinates are known zeros.
-    Each part is a program of its own, so parts of few columns are not divided.
-    """
-    size, count = seeds.shape
-    if count <= _FEW:
-        return [seeds]
-    least = max(_LEAST, count // _LEAST)
-    cuts, first, low, high = [], 0, size, 0
-    for k, column in enumerate(seeds.T != 0):
-        if least <= k - first and k <= count - least and not np.any(column[low:high]):
-            cuts.append(k)
-            first, low, high = k, size, 0
-        low = min(low, int(np.argmax(column)))
-        high = max(high, size - int(np.argmax(column[::-1])))
-    return np.split(seeds, cuts, axis=1)
+    rows = jnp.asarray(seeds.T, x.dtype)
+    if jax.default_backend() == "cpu":
+        return jnp.moveaxis(jax.lax.map(push, rows), 0, -1)
+    # Other processors take all columns at the same time.
+    return jax.vmap(push, out_axes=-1)(rows)
 
 
 class _Columns:

@@ -57,7 +57,7 @@ class BlockElimination:
         known = known_owners(pattern, owners)
         nodes = min(elimination_orders(pattern, known), key=_cost)
         self.cost, self.width = _cost(nodes), nodes.width
-        self.colours = _colours_by_kind(pattern, known < 0)
+        self.colours = column_colours(pattern, np.arange(self.size))
         self.num_colours = int(self.colours.max(initial=0)) + 1
         self._place_unknowns(nodes)
         numbers = self._number_blocks(nodes)
@@ -116,7 +116,7 @@ class BlockElimination:
         return (
             f"{len(self.order)} nodes of up to {self.width} unknowns, coupled by "
             f"{len(self.places) - len(self.order)} blocks, "
-            f"{self.num_colours} columns evaluated together"
+            f"found by {self.num_colours} products with the Jacobian"
         )
 
     def is_cheaper_than_dense(self) -> bool:
@@ -203,22 +203,6 @@ class BlockFactors(AbstractFactors):
     def solve_transposed(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
         substituted = self.elimination.substituted_transposed
         return in_one_function(substituted)(self.blocks, right)
-
-
-def _colours_by_kind(
-    pattern: "scipy.sparse.csr_array", is_multiplier: np.ndarray
-) -> np.ndarray:
-    """Colours of the columns, different ones for coordinates and for multipliers.
-
-    The equations are linear in the multipliers, so products with their columns need few
-    operations.
-    """
-    colours, first = np.zeros(is_multiplier.size, int), 0
-    for own in (~is_multiplier, is_multiplier):
-        columns = scipy.sparse.csr_array(pattern.tocsc()[:, own])
-        colours[own] = first + column_colours(columns, np.arange(np.sum(own)))
-        first = int(colours.max(initial=-1)) + 1
-    return colours
 
 
 def _cost(nodes: Nodes) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from ..._programs import batched_columns, columns_along, shape_of
+from ..._programs import columns_along, columns_in_turn, shape_of
 
 
 def coloured_products(
@@ -23,7 +23,7 @@ def coloured_products(
     If they are needed `rarely`, a program is chosen that compiles quickly.
     """
     numbers = np.arange(int(colours.max(initial=0)) + 1)
-    columns = batched_columns if rarely else columns_along
+    columns = columns_in_turn if rarely else columns_along
     return columns(fn, x, colours[:, None] == numbers)
 
 

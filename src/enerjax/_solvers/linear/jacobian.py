@@ -12,7 +12,7 @@ import scipy
 from jaxtyping import Array, Float, PyTree
 
 from ..._programs import (
-    batched_columns,
+    columns_in_turn,
     in_one_function,
     jacobian_columns,
     jacobian_pattern,
@@ -59,7 +59,7 @@ class Dense:
     def evaluate(self, fn: Callable[[Array], Array], x: Float[Array, " n"]) -> Array:
         if self._colours is None:
             return (
-                batched_columns(fn, x, np.eye(x.size))
+                columns_in_turn(fn, x, np.eye(x.size))
                 if self._rarely
                 else (jacobian_columns(fn, x))
             )
