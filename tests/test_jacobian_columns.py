@@ -5,7 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from enerjax._programs.sparsity.jacobian_columns import columns_along, jacobian_columns
+from enerjax._programs.sparsity.jacobian_columns import (
+    columns_along,
+    columns_in_turn,
+    jacobian_columns,
+)
 from enerjax._solvers.linear.dense import inverse
 
 
@@ -120,6 +124,24 @@ def test_columns_along_seeds():
     ours = columns_along(fn, X, seeds)
     assert ours.shape == (2, 3, 4)
     np.testing.assert_allclose(ours, jax.jacfwd(fn)(X) @ seeds, rtol=0, atol=1e-14)
+
+
+def test_columns_in_turn():
+    """The same columns, also their derivatives, by a program of one product."""
+    fn = lambda x: jnp.sin(x.reshape(2, 3)) * x[0]
+    for count in (4, 40):
+        seeds = np.cos(np.arange(6.0 * count).reshape(6, count))
+        in_turn = lambda x, seeds=seeds: columns_in_turn(fn, x, seeds)
+        together = lambda x, seeds=seeds: columns_along(fn, x, seeds)
+        for of in (lambda f: f(X), lambda f: jax.jvp(f, (X,), (jnp.cos(X),))[1]):
+            ours, theirs = of(in_turn), of(together)
+            assert ours.shape == (2, 3, count)
+            np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-14)  # round-off
+        (scan,) = [
+            e for e in jax.make_jaxpr(in_turn)(X).jaxpr.eqns if e.primitive.name == "scan"
+        ]
+        assert scan.params["length"] == count
+        assert scan.outvars[0].aval.shape == (count, 2, 3)
 
 
 def test_columns_that_are_zero_are_not_computed():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import enerjax as ej
-from enerjax._programs import in_one_function
+from enerjax._programs import in_one_function, programs_within
 from enerjax._solvers import eigh, find_root, Newton
 
 from .helpers import long
@@ -39,6 +39,46 @@ def test_derivatives_and_lanes():
     ):
         close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=0)
         jax.tree.map(close, jax.jit(lambda of=of: of(whole))(), of(smooth))
+
+
+def test_reverse_passes_know_their_index_tables():
+    """Those of constants, and those that the program computes from constants.
+
+    With unknown tables the reverse pass of a large system is left to XLA.
+    """
+    order, flags = np.arange(40)[::-1], np.arange(40) % 2 == 0
+
+    def turned(x):
+        places = jnp.where(flags, order, 39 - order)
+        change = lambda x, _: (jnp.sin(x[order]) * x[places], None)
+        return jax.lax.scan(change, x, None, length=9)[0]
+
+    whole = jax.jit(in_one_function(turned))
+    slope = jax.grad(lambda x: jnp.sum(whole(x) ** 2))
+    x = jnp.linspace(0.5, 1.5, 40)
+    programs = one_functions(jax.jit(slope).trace(x).jaxpr.jaxpr)
+    assert len(programs) == 2
+    tables = [
+        known
+        for program in programs
+        for var, known in zip(program.jaxpr.invars, program.known, strict=True)
+        if jnp.issubdtype(var.aval.dtype, jnp.integer) and var.aval.ndim
+    ]
+    assert len(tables) >= 2
+    assert not any(known is None for known in tables)
+    theirs = jax.grad(lambda x: jnp.sum(turned(x) ** 2))(x)
+    np.testing.assert_allclose(jax.jit(slope)(x), theirs, rtol=1e-13)  # round-off
+
+
+def one_functions(jaxpr):
+    """The programs of machine code in a program, in their order."""
+    found = []
+    for eqn in jaxpr.eqns:
+        if "program" in eqn.params:
+            found.append(eqn.params["program"])
+        else:
+            found += [x for inner in programs_within(eqn) for x in one_functions(inner)]
+    return found
 
 
 # Derivatives of batches ------------------------------------------------------------------

@@ -19,7 +19,9 @@ def known_indices(jaxpr: Any, inputs: dict[Any, np.ndarray]) -> dict[Any, np.nda
     known = dict(inputs)
     for eqn in jaxpr.eqns:
         values = [
-            np.asarray(x.val, x.aval.dtype) if isinstance(x, Literal) else known.get(x)
+            np.asarray(x.val, x.aval.dtype)  # pyright: ignore
+            if isinstance(x, Literal)
+            else known.get(x)
             for x in eqn.invars
         ]
         if any(x is None for x in values):

@@ -145,12 +145,9 @@ class Program:
 
     def __call__(self, numbers: Sequence[Array]) -> list[Array]:
         """The outputs, computed by operations of JAX."""
-        return jaxpr_as_fun(ClosedJaxpr(self.jaxpr, ()))(*self.filled(numbers))
-
-    def filled(self, numbers: Sequence[Any]) -> list[Any]:
-        """The inputs, with the values of those that are known."""
         pairs = zip(numbers, self.known, strict=True)
-        return [x if known is None else known for x, known in pairs]
+        values = [x if known is None else known for x, known in pairs]
+        return jaxpr_as_fun(ClosedJaxpr(self.jaxpr, ()))(*values)
 
     def run(self, numbers: Sequence[Array]) -> list[Array]:
         """The outputs, computed by machine code where that is possible."""
@@ -206,7 +203,8 @@ def run_closed(
 def _tables(jaxpr: Any, inputs: Iterable[tuple[Any, Any]]) -> dict[int, np.ndarray]:
     """The outputs that are tables of indices with known values, by their identities."""
     outputs = [x for x in jaxpr.outvars if not isinstance(x, Literal)]
-    if not any(x.aval.ndim and x.aval.dtype.kind in "iu" for x in outputs):
+    is_table = lambda x: x.aval.ndim and jnp.issubdtype(x.aval.dtype, jnp.integer)
+    if not any(map(is_table, outputs)):
         return {}
     places = {variable: _known_places(x) for variable, x in inputs}
     known = known_indices(jaxpr, {v: x for v, x in places.items() if x is not None})
@@ -256,7 +254,6 @@ def _jvp(primals: Any, tangents: Any, *, program: Program) -> tuple[list, list]:
         values = lambda *own: _split(smooth, program(_merged(has_tangent, own, still)))
         return jax.linearize(values, *own, has_aux=True)
 
-    primals = program.filled(primals)
     closed, like = jax.make_jaxpr(linearised, return_shape=True)(*primals)
     pushed = jax.make_jaxpr(lambda push, moved: push(*moved))(like[1], moved)
     depends = _depends(pushed, len(moved))
@@ -286,8 +283,7 @@ def _depends(closed: ClosedJaxpr, linear: int) -> list[bool]:
 
 def _transpose(cotangents: Any, *numbers: Any, program: Program) -> list:
     wanted = [ad.is_undefined_primal(x) for x in numbers]
-    # JAX hands index tables from the program to its transpose as numbers like others.
-    unknown, known = _split(wanted, program.filled(numbers))
+    unknown, known = _split(wanted, numbers)
     has_cotangent = [not isinstance(ct, ad.Zero) for ct in cotangents]
     cotangents, _ = _split(has_cotangent, cotangents)
 
