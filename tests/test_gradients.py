@@ -246,6 +246,12 @@ def test_a_failed_lane_leaves_the_gradients_of_the_others_finite():
     healthy, okay = slopes(steps.at[1].set(0.015))
     assert np.all(okay)
     np.testing.assert_allclose(slope[good], healthy[good], rtol=1e-10)
+    # A loss that is NaN for failed runs has a derivative of zero there, so that the mean of
+    # the others has the right one.
+    assert slope[1] == 0
+    mean = lambda steps: jnp.nanmean(jax.vmap(lambda h: fn(h)[0] ** 2)(steps))
+    found, expected = jax.grad(mean)(steps), jax.grad(mean)(steps[good])
+    np.testing.assert_allclose(found[good], expected, rtol=1e-10)
 
 
 def test_numbers_that_the_functions_close_over_count():
