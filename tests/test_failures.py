@@ -238,3 +238,21 @@ def test_the_first_failure_is_kept():
     shorter = solve("stiff", "kappa", 0.5, h=0.001, steps=done + 1)
     assert shorter.result == solution.result
     assert int(shorter.stats.completed_steps) == done
+
+
+def test_derivatives_of_a_failed_run_raise():
+    """Also where nobody reads its values: XLA would leave the check out."""
+    system, start, args = ej.problems.double_pendulum()
+
+    def end(v, h):
+        start_ = ej.State(start.q, v)
+        scheme = ej.EnergyPreserving()
+        sol = ej.simulate(system, scheme, start_, args, h=h, num_steps=10)
+        return jnp.sum(sol.ys.q[-1])
+
+    slope = jax.jit(jax.grad(end))
+    push = jax.jit(lambda v, h: jax.jvp(end, (v, h), (v + 1, h))[1])
+    for derivative in (slope, push):
+        assert np.all(np.isfinite(derivative(start.v, 0.01)))
+        with pytest.raises(Exception, match="Newton's method|right angle"):
+            jax.block_until_ready(derivative(start.v, 1.5))

@@ -254,6 +254,37 @@ def test_a_failed_lane_leaves_the_gradients_of_the_others_finite():
     np.testing.assert_allclose(found[good], expected, rtol=1e-10)
 
 
+@pytest.mark.slow
+def test_gradient_of_divided_steps_whose_whole_step_is_infinite():
+    """The search for the whole step ends far from any root, and its rates do not count."""
+    count, order = 4, np.argsort(np.cos(np.arange(4)))
+
+    def potential(q, args):
+        r = q.reshape(count, 2)
+        stretch = jnp.sum((r - r[order]) ** 2, axis=1) - 1.3
+        return args["k"] * jnp.sum(stretch**4) + 9.81 * jnp.sum(r[:, 1])
+
+    def rods(q, args):
+        r = jnp.concatenate([jnp.zeros((1, 2)), q.reshape(count, 2)])
+        return jnp.sum(jnp.diff(r, axis=0) ** 2, axis=1) - 1.0
+
+    system = ej.System(jnp.eye(2 * count), potential, rods)
+    angles = np.linspace(0.1, 0.9, count)
+    q = np.cumsum(np.stack([np.cos(angles), np.sin(angles)], 1), 0).ravel()
+    start = ej.initial_state(system, q, np.zeros(2 * count), {"k": 0.3})
+
+    def end(k):
+        scheme, args = ej.EnergyConsistent(0.0), {"k": k}
+        sol = ej.simulate(system, scheme, start, args, h=0.06, num_steps=3, max_halvings=3)
+        return jnp.sum(sol.ys.q[-1] * jnp.cos(jnp.arange(2 * count))), sol.stats.halvings
+
+    (_, halvings), slope = jax.jit(jax.value_and_grad(end, has_aux=True))(0.3)
+    assert np.all(halvings > 0)
+    values = jax.jit(lambda k: end(k)[0])
+    difference = (values(0.3 + 1e-6) - values(0.3 - 1e-6)) / 2e-6
+    np.testing.assert_allclose(slope, difference, rtol=1e-7)  # round-off of the difference
+
+
 def test_numbers_that_the_functions_close_over_count():
     def tip(g):
         rod = lambda q, args: jnp.array([q @ q - 1.0])

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._operators import AbstractModel, make_model, Time
-from .._programs import compiled, is_known
+from .._programs import compiled, is_known, raising
 from .._solvers import find_root, largest, Newton, RootFinder
 from .._system import AbstractSystem, check_system, HamiltonianSystem, State, System
 from .._types import Args, Coordinates, Flag, Increments, Multipliers, Real, Scalar
@@ -100,7 +100,7 @@ def equilibrium(
         "damped run come closer, or follow the loads in `steps`."
     )
     if not is_known((ok, found)):
-        return eqx.error_if(found, ~ok, message)
+        return raising(lambda x: eqx.error_if(x, ~ok, message), found)
     if not ok:
         raise ValueError(f"{message}{reached} Largest residual, scaled: {residual:.1e}.")
     return found

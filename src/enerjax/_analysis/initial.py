@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._operators import make_model
-from .._programs import compiled_for_once, is_known
+from .._programs import compiled_for_once, is_known, raising
 from .._system import AbstractSystem, check_system, State, System
 from .._types import (
     Args,
@@ -201,7 +201,7 @@ def _raise_unless(
 ) -> ConsistentStart:
     """Raises an error with the figures now, or without them at run time if traced."""
     if not is_known((good, start)):
-        return eqx.error_if(start, ~good, message)
+        return raising(lambda x: eqx.error_if(x, ~good, message), start)
     if not good:
         raise ValueError(f"{message} {figures()}")
     return start

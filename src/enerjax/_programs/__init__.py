@@ -33,6 +33,7 @@ from .machine_code import (
     why_not_one_function as why_not_one_function,
 )
 from .places import at_places as at_places, with_any as with_any
+from .raising import raising as raising
 from .simplification import simplified as simplified
 from .sparsity.jacobian_columns import (
     columns_along as columns_along,

@@ -10,8 +10,8 @@ from .jaxprs import known_numbers
 from .numpy_primitives import evaluated
 
 
-# Arrays with more numbers than this are neither computed nor compared.
-MANY = 2**17
+# Larger tables are not computed: they would be constants of a megabyte in the program.
+_MANY = 2**17
 
 
 def known_indices(jaxpr: Any, inputs: dict[Any, np.ndarray]) -> dict[Any, np.ndarray]:
@@ -26,16 +26,21 @@ def known_indices(jaxpr: Any, inputs: dict[Any, np.ndarray]) -> dict[Any, np.nda
         ]
         if any(x is None for x in values):
             continue
-        indices = computed_indices(eqn, values)
+        indices = computed_indices(eqn, values, _MANY)
         if indices is not None:
             known.update(zip(eqn.outvars, indices, strict=True))
     return known
 
 
-def computed_indices(equation: Any, values: list[Any]) -> list[Any] | None:
-    """The outputs of an equation that computes indices, if its inputs are known."""
+def computed_indices(
+    equation: Any, values: list[Any], most: int
+) -> list[np.ndarray] | None:
+    """The outputs of an equation that computes indices, if its inputs are known.
+
+    `None` too if an output has more than `most` numbers.
+    """
     avals = [x.aval for x in equation.outvars]
-    if any(not _is_index(x) or x.size > MANY for x in avals):
+    if any(not _is_index(x) or x.size > most for x in avals):
         return None
     known = [known_numbers(x) for x in values]
     # NumPy rounds numbers to indices in another way than XLA.

@@ -17,7 +17,11 @@ from jaxtyping import Array, PyTree
 
 from .compiled import is_hashable
 from .jaxprs import evaluate, interpret, known_numbers
-from .known_indices import computed_indices, MANY
+from .known_indices import computed_indices
+
+
+# Constants with more numbers than this are not compared, and such indices not computed.
+_MANY = 4096
 
 
 def simplified(fn: Callable[..., PyTree[Array]]) -> Callable[..., PyTree[Array]]:
@@ -47,7 +51,7 @@ def _shared(constants: list[Any]) -> list[Any]:
 
 def _content(constant: Any) -> Any:
     """Equal for arrays of equal numbers; the identity of a traced or a large array."""
-    array = known_numbers(constant) if np.size(constant) <= MANY else None
+    array = known_numbers(constant) if np.size(constant) <= _MANY else None
     if array is None:
         return id(constant)
     return array.tobytes(), array.shape, array.dtype, jnp.asarray(constant).weak_type
@@ -81,7 +85,7 @@ class _Once:
         if id(equation) not in self._needed:
             return [None] * len(equation.outvars)
         primitive, params = equation.primitive, equation.params
-        indices = computed_indices(equation, values)
+        indices = computed_indices(equation, values, _MANY)
         if indices is not None:
             content = lambda x: (x.tobytes(), x.shape, x.dtype)
             return [self._indices.setdefault(content(x), x) for x in indices]

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from .._analysis import mobility
-from .._programs import is_known
+from .._programs import is_known, raising
 from .._results import RESULTS
 from .._system import AbstractSystem
 from .._types import Args, Flag, Scalar
@@ -32,7 +32,7 @@ def raise_failure(
     the same.
     """
     if not is_known((solution, failed, args, reached, h)):
-        return solution.result.error_if(solution, failed)
+        return raising(lambda x: solution.result.error_if(x, failed), solution)
     if not failed:
         return solution
     num_completed = int(solution.stats.completed_steps)

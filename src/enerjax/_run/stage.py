@@ -259,6 +259,9 @@ def _solved(
 ) -> Solved:
     """The result of a step whose search has ended with `root`."""
     z = jax.tree.map(jnp.multiply, root.value, prepared.scales.unknown)
+    # What is not a root may be infinite. The step does not count then, but the reverse pass
+    # would multiply its derivatives by zero.
+    z = jax.tree.map(lambda x, y: jnp.where(root.found, x, y), z, prepared.flight)
     end = scheme.finish(z, problem)
     tests = lambda: _gradients_reverse(model, start, end.state)
     no = jnp.array(False)

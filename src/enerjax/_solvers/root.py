@@ -62,7 +62,10 @@ def _root_jvp(primals, tangents):
     is_none = lambda x: x is None
     unmoved = jax.tree.map(is_none, t_args, is_leaf=is_none)
     fixed, moved = eqx.partition(args, unmoved, is_leaf=is_none)
-    flat, unravel, flat_fn = flattened(fn, root.value)
+    # What is not a root may be infinite. Its rates do not count, and must not be NaN: the
+    # reverse pass would multiply them by zero.
+    value = jax.tree.map(lambda x: jnp.where(root.found, x, 0), root.value)
+    flat, unravel, flat_fn = flattened(fn, value)
     by_args = lambda moved: flat_fn(flat, eqx.combine(moved, fixed))
     # Programs without a chord method have no parts, and can be longer as one function.
     by_args = by_args if chord is None else part(by_args)
@@ -74,7 +77,7 @@ def _root_jvp(primals, tangents):
         turned = _null_space_rate(exact, solve, flat_fn, flat, (moved, fixed), t_args)
         change = exact.refined(solve, -rate) + turned
     elif chord is not None and has_chord_search(root_finder):
-        change = _change(exact, chord, root_finder, root.value, args, -rate)
+        change = _change(exact, chord, root_finder, value, args, -rate)
     else:
         change = exact.solve(flat, -rate)
     # Only the value of the root is differentiated. Its statistics have zero tangents.

@@ -201,8 +201,12 @@ def run_closed(
 
 
 def _tables(jaxpr: Any, inputs: Iterable[tuple[Any, Any]]) -> dict[int, np.ndarray]:
-    """The outputs that are tables of indices with known values, by their identities."""
+    """The outputs that are tables of indices with known values, by their identities.
+
+    Numbers of a weak type are left out, because arrays of NumPy have none.
+    """
     outputs = [x for x in jaxpr.outvars if not isinstance(x, Literal)]
+    outputs = [x for x in outputs if not x.aval.weak_type]
     is_table = lambda x: x.aval.ndim and jnp.issubdtype(x.aval.dtype, jnp.integer)
     if not any(map(is_table, outputs)):
         return {}

@@ -1,10 +1,10 @@
-"""Columns of Jacobians, side by side.
+"""Columns of Jacobians, side by side or one after the other.
 
-Under `jax.vmap` the columns are the first axis of every array, and the innermost loops of
-the machine go over the two or three entries of a vector. Here they are the last axis, and
-vector instructions take several columns at a time. Every array has only those columns that
-can differ from zero in it: the derivatives of a tension with respect to coordinates are
-not computed with respect to multipliers too.
+`columns_along` computes them side by side. Under `jax.vmap` the columns are the first axis
+of every array, and the innermost loops of the machine go over the two or three entries of a
+vector. There they are the last axis, and vector instructions take several columns at a
+time. Every array has only those columns that can differ from zero in it: the derivatives of
+a tension with respect to coordinates are not computed with respect to multipliers too.
 """
 
 import functools
@@ -54,9 +54,9 @@ def columns_in_turn(
 ) -> Float[Array, "... k"]:
     """The same derivatives as `columns_along`, one column after the other.
 
-    The program has a single product, so that it is compiled many times as fast. It computes
-    entries that are zero, but its code stays in the cache of the processor: for large
-    systems it takes no longer.
+    The program has a single product, and is compiled several times as fast as all columns
+    beside one another. It computes entries that are zero, but its code stays in the cache
+    of the processor: a step of 6 or more bodies in space by Newton's method takes as long.
     """
     _, push = jax.linearize(fn, x)
     rows = jnp.asarray(seeds.T, x.dtype)

@@ -135,8 +135,8 @@ def as_dense(matrix: Symmetric) -> Float[Array, "n n"]:
 def diagonal_of(matrices: Float[Array, "... n n"]) -> Float[Array, "... n"]:
     """The entries on the diagonals.
 
-    `jax.numpy.diagonal` has a branch for some processors, in which the derivative of a
-    program loses the places of the entries.
+    After `jax.numpy.diagonal`, which has a branch for some processors, the reverse pass
+    would not know the table of the places, and be left to XLA.
     """
     places = np.arange(matrices.shape[-1])
     return matrices[..., places, places]
