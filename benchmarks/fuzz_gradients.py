@@ -68,7 +68,7 @@ def _turning(problem: Callable[[], Any], low: float, high: float):
 
     def draw(rng: Generator):
         _, start, args = problem()
-        q = start.q + 0.02 * rng.normal(size=start.q.shape)
+        q = start.q + 0.01 * rng.normal(size=start.q.shape)
         v = start.v * rng.uniform(0.5, 1.5) + 0.3 * rng.normal(size=start.v.shape)
         return q, v, _shake(rng, args), rng.uniform(low, high)
 
