@@ -46,6 +46,22 @@ FAULTS = (
         of("machine_code_derivatives::test_reverse_passes_know_their_index_tables"),
     ),
     Fault(
+        "failures: gradients without a check",
+        "_programs/raising.py",
+        "rate * one.astype(rate.dtype)",
+        "rate",
+        "XLA leaves out the check of a run of which only the gradient is asked for.",
+        of("failures::test_derivatives_of_a_failed_run_raise"),
+    ),
+    Fault(
+        "failures: rates at what is no root",
+        "_run/stage.py",
+        "jnp.where(root.found, x, y), z, prepared.flight",
+        "x, z, prepared.flight",
+        "The reverse pass multiplies infinite rates of a failed search by zero.",
+        of("gradients::test_gradient_of_divided_steps_whose_whole_step_is_infinite"),
+    ),
+    Fault(
         "slices: written where they were found",
         "_programs/machine_code/loops.py",
         "is_array and sum(x is after for x in read) == 1",
