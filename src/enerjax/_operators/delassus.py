@@ -105,9 +105,9 @@ class DelassusMatrix(eqx.Module):
         (M + S^T S) u + C^T x = M free,   C u = C free
         """
         assert self.elastic is not None
-        return self._beside_strains(self.elastic, jax.vmap(self._strain_rates)(free), free)[
-            1
-        ]
+        strains = jax.vmap(self._strain_rates)(free)
+        _, velocities = self._beside_strains(self.elastic, strains, free)
+        return velocities
 
     def elastic_force(self, velocity: Velocities) -> Velocities:
         """`S^T S velocity`"""
