@@ -353,13 +353,16 @@ def run_loop(
         return after, _record_of(after, attempts, kept)
 
     begin = stepper.begin(start)
-    found = lambda x: (x.state, x.multipliers)
-    begin = eqx.tree_at(found, begin, moving(found(begin), (stepper, begin)))
     kept = Begin(
         kept=keep(stepper.model_at(begin))(begin.state, begin.place),
         multipliers=begin.multipliers,
         varying=begin.varying,
     )
+    # The multipliers in the carry count only after a step, and are then others. With rates
+    # they would have derivatives wherever the end of the run has some.
+    first = begin.state, jax.lax.stop_gradient(begin.multipliers)
+    found = lambda x: (x.state, x.multipliers)
+    begin = eqx.tree_at(found, begin, moving(first, (stepper, begin)))
     group = functools.partial(one_group, stepper)
     end, record = over_groups(group, begin, num_groups, jnp.array(True))
     is_whole_run = end.place >= plan.last

@@ -103,7 +103,7 @@ def _change(
     correct = lambda x: ravel_pytree(chord.correct(unravel(x), args, prepared))[0]
     by_entries = None
     if not isinstance(root_finder, ChordAlone):
-        by_entries = lambda right: exact.solve(flat, right)
+        by_entries = lambda: exact.constant_solvers(flat)
     return jacobian_solver(exact.value, flat, correct, by_entries)(right)
 
 

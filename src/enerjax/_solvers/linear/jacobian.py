@@ -1,7 +1,7 @@
 """Functions with their Jacobians, which are stored as their size and sparsity suggest."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -25,6 +25,8 @@ from .dense import AbstractFactors, Inverse, inverse, LU, SMALL
 from .elimination_order import Owners
 from .user_solver import AbstractSparseSolver, LineaxFactors, Sparse, SuperLU
 
+
+Map: TypeAlias = Callable[[Float[Array, " n"]], Float[Array, " n"]]
 
 # Equations with more unknowns than this and without `owners` are left to SuperLU.
 _MANY = 256
@@ -154,28 +156,39 @@ class Linearisable(eqx.Module):
         if is_small and self.regularisation is None:
             found = in_one_function(lambda x: inverse(self.jacobian(x)))(x)
             return lambda right: found @ right
-        matrix = self.jacobian(x)
         if is_small:
             # An explicit inverse of a nearly singular matrix is too inaccurate.
+            matrix = self.jacobian(x)
             return lambda right: jnp.linalg.solve(matrix, right)
-        matrix = jax.lax.stop_gradient(matrix)
-        factors = self.form.empty(x.size, x.dtype).renewed(matrix)
+        solve, solve_transposed = self.constant_solvers(x)
 
         def product(t: Array) -> Array:
             image = jax.jvp(self.value, (x,), (t,))[1]
             return image if self.regularisation is None else image + self.regularisation * t
 
-        def solve_transposed(_: Callable, right: Array) -> Array:
-            if isinstance(self.form, Sparse):
-                return self.form.solve_transposed(matrix, right)
-            if isinstance(factors, BlockFactors):
-                return factors.solve_transposed(right)
-            # `linear_transpose` has no rule for programs compiled into one function.
-            return jax.vjp(factors.solve, right)[1](right)[0]
-
         return lambda right: jax.lax.custom_linear_solve(
-            product, right, lambda _, right: factors.solve(right), solve_transposed
+            product,
+            right,
+            lambda _, right: solve(right),
+            lambda _, right: solve_transposed(right),
         )
+
+    def constant_solvers(self, x: Float[Array, " n"]) -> tuple[Map, Map]:
+        """Functions that solve with the regularised Jacobian at `x` and its transpose.
+
+        They have no derivatives with respect to `x`.
+        """
+        matrix, form = jax.lax.stop_gradient(self.jacobian(x)), self.form
+        if self.is_dense and x.size <= SMALL:
+            found = in_one_function(inverse)(matrix)
+            return found.__matmul__, found.T.__matmul__
+        factors = form.empty(x.size, x.dtype).renewed(matrix)
+        if isinstance(form, Sparse):
+            return factors.solve, lambda right: form.solve_transposed(matrix, right)
+        if isinstance(factors, BlockFactors):
+            return factors.solve, factors.solve_transposed
+        # `linear_transpose` has no rule for programs compiled into one function.
+        return factors.solve, lambda right: jax.vjp(factors.solve, right)[1](right)[0]
 
 
 def linearisable(

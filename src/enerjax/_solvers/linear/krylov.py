@@ -181,17 +181,26 @@ def _found(product: Map, approximate: Map, right: Vector) -> Vector:
 
 
 def jacobian_solver(
-    fn: Map, x: Vector, approximate: Map, otherwise: Map | None = None
+    fn: Map,
+    x: Vector,
+    approximate: Map,
+    exact: Callable[[], tuple[Map, Map]] | None = None,
 ) -> Map:
     """A function that solves with the Jacobian of `fn` at `x`, and can be transposed.
 
-    `approximate` is linear and nearly inverts the Jacobian, and `otherwise` solves where
-    it does not; see `solve_by_products`.
+    `approximate` is linear and nearly inverts the Jacobian. Where it does not, the first of
+    the functions `exact()` solves, and the second one solves with the transpose; see
+    `solve_by_products`.
     """
+
+    # What the exact solvers need, such as the entries of the Jacobian, is computed only
+    # where they are called.
+    def otherwise(number: int) -> Map | None:
+        return None if exact is None else lambda right: exact()[number](right)
 
     def solve(right: Vector) -> Vector:
         _, push = jax.linearize(fn, x)
-        return solve_by_products(push, approximate, right, otherwise)
+        return solve_by_products(push, approximate, right, otherwise(0))
 
     def transposed(of: Map) -> Map:
         """The transpose of the derivative at `x`, which of a linear map is the map."""
@@ -199,11 +208,9 @@ def jacobian_solver(
         return lambda y: pull(y)[0]
 
     def solve_transposed(right: Vector) -> Vector:
-        other = otherwise
-        # Within the function: what the other solver needs, such as the entries of the
-        # Jacobian, is computed only where it is called.
-        by = None if other is None else lambda y: transposed(other)(y)
-        return solve_by_products(transposed(fn), transposed(approximate), right, by)
+        return solve_by_products(
+            transposed(fn), transposed(approximate), right, otherwise(1)
+        )
 
     # The products that JAX passes to these have lost the known indices, without which the
     # iterations cannot be one function.
