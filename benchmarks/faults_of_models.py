@@ -176,8 +176,8 @@ FAULTS = (
     Fault(
         "sweeps: constants are not told",
         "_programs/digest.py",
-        "        tell(checksum([const]))\n",
-        "        tell(np.shape(const))\n",
+        "            self._tell(checksum([const]))\n",
+        "            self._tell(np.shape(const))\n",
         "Sweeps that differ in a table of constants are taken for the same.",
         of("sweep_resume::test_another_sweep_is_not_resumed"),
     ),

@@ -36,9 +36,9 @@ def pytest_collection_modifyitems(items):
 @pytest.fixture(autouse=True, scope="session")
 def compile_quickly():
     """Also by LLVM, for the same reason."""
-    from enerjax._programs.machine_code import library
+    from enerjax._programs.machine_code import compiler
 
-    library.OPTIMISATION = 0
+    compiler.OPTIMISATION = 0
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ import time
 import jax
 
 import enerjax as ej
-from enerjax._programs.machine_code import library
+from enerjax._programs.machine_code import compiler
 
 
 STEPS = 2003
@@ -38,7 +38,7 @@ def motion(num_steps=STEPS, **options):
 def main():
     jax.config.update("jax_enable_x64", True)
     # As in the tests: at another level the digits of round-off are others.
-    library.OPTIMISATION = 0
+    compiler.OPTIMISATION = 0
     pieces = itertools.count(1)
 
     def die_after_two_pieces(done, whole):

@@ -7,6 +7,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import enerjax as ej
+from enerjax._operators import make_model
 from enerjax._programs.jaxprs import programs_within
 from enerjax._run import reverse as reverse_pass
 from enerjax._solvers import root
@@ -360,3 +361,36 @@ def test_a_derivative_traces_the_search_and_its_rule_once(monkeypatch):
 
     jax.jit(jax.grad(end)).trace(0.01)
     assert sorted(calls) == ["search", "with_jacobian"]
+
+
+def first_multipliers(p, q):
+    """Those of a chain at the start of a run."""
+    chain, _, args, *_ = ej.problems.chain(3)
+    start, args = ej.State(q, p["v"]), args | dict(m=p["m"], g=p["g"])
+    return jnp.sum(jnp.sin(make_model(chain, start, args).multipliers(start)))
+
+
+def multipliers_by_elimination(p, q):
+    """The same from the equations of motion with a dense matrix."""
+    chain, _, args, *_ = ej.problems.chain(3)
+    args = args | dict(m=p["m"], g=p["g"])
+    rows = jax.jacrev(lambda q: chain.constraint(q, args))
+    slope = jax.grad(lambda q: chain.potential(q, args))(q)
+    inertia = jax.hessian(lambda v: chain.kinetic_energy(ej.State(q, v), args))(p["v"])
+    _, change = jax.jvp(lambda q: rows(q) @ p["v"], (q,), (p["v"],))
+    free = jnp.linalg.solve(inertia, -slope)
+    delassus = rows(q) @ jnp.linalg.solve(inertia, rows(q).T)
+    return jnp.sum(jnp.sin(jnp.linalg.solve(delassus, rows(q) @ free + change)))
+
+
+def test_first_and_second_derivatives_of_the_first_multipliers():
+    """They are those of linear equations; see `SeparableModel.accelerations`."""
+    start = ej.problems.chain(3).start
+    p = dict(m=jnp.array([0.5, 0.3, 0.2]), g=jnp.array(9.81), v=start.v + 0.1)
+    values, expected = (
+        [transform(fn)(p, start.q) for transform in (jax.value_and_grad, jax.hessian)]
+        for fn in (first_multipliers, multipliers_by_elimination)
+    )
+    for x, y in zip(jax.tree.leaves(values), jax.tree.leaves(expected), strict=True):
+        # Round-off of two solutions.
+        np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9)

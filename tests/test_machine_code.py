@@ -14,7 +14,14 @@ from jax.ad_checkpoint import checkpoint_name
 
 import enerjax as ej
 from enerjax._programs import at_places, in_one_function, why_not_one_function
-from enerjax._programs.machine_code import emission, graph, library, loops, scheduling
+from enerjax._programs.machine_code import (
+    compiler,
+    emission,
+    graph,
+    library,
+    loops,
+    scheduling,
+)
 from enerjax._solvers.linear.dense import Inverse
 
 from .helpers import EPS, long
@@ -751,10 +758,10 @@ def test_code_ordered_quickly_gives_the_same_numbers(monkeypatch):
         set_option(program, option)
 
     monkeypatch.setattr(llvmlite.binding, "set_option", recorded)
-    monkeypatch.setattr(library, "_LONG_TEXT", 0)
+    monkeypatch.setattr(compiler, "_LONG_TEXT", 0)
     np.testing.assert_array_equal(jax.jit(in_one_function(other))(X)[0], usual)
     # They do not stay.
-    assert options == [*library._QUICK, *library._USUAL]
+    assert options == [*compiler._QUICK, *compiler._USUAL]
 
 
 def is_gather(x):
@@ -1067,13 +1074,13 @@ def test_a_long_branch_is_compiled_when_it_is_taken(monkeypatch):
 
 def test_code_of_a_large_system_hardly_grows_with_its_rows(monkeypatch):
     texts = []
-    add = library._Library.add
+    added = library._Library.added
 
-    def count(self, name, parts, *others):
-        texts.append(sum(map(len, parts)))
-        return add(self, name, parts, *others)
+    def count(self, code):
+        texts.append(sum(map(len, code.texts)))
+        return added(self, code)
 
-    monkeypatch.setattr(library._Library, "add", count)
+    monkeypatch.setattr(library._Library, "added", count)
     problem = ej.problems.chain(70)
     sizes = []
     for num_steps in (30, 250):

@@ -13,7 +13,6 @@ for the velocities in closed form.
 
 import functools
 from collections.abc import Callable
-from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -68,10 +67,6 @@ from .elements import (
     Summands,
 )
 from .interval import Gradient, gradient_and_work, Increment, Scales, Time, time_rate
-
-
-# Accelerations and multipliers, or forces and changes of the rates of joints.
-_Motion: TypeAlias = tuple[Velocities, JointMultipliers]
 
 
 class SeparableModel(AbstractModel):
@@ -585,29 +580,32 @@ class SeparableModel(AbstractModel):
         `slope` are the forces that the accelerations balance, and `free_rate` the rates of
         the joints without accelerations.
         """
-        q, t = state.q, state.t
+        q, t, count = state.q, state.t, state.v.size
         # Derivatives are those of the linear equations, and not of the elimination.
         delassus = jax.lax.stop_gradient(self.delassus_matrix(state))
 
-        def product(x: _Motion) -> _Motion:
-            acceleration, multipliers = x
+        def product(x: Array) -> Array:
+            acceleration, multipliers = x[:count], x[count:]
             reaction = self._lowered(*self._by_rates((q, t), multipliers))
             force = self.inertia @ acceleration + reaction
-            return force, self.joint_change(q, acceleration, t)
+            return jnp.concatenate([force, self.joint_change(q, acceleration, t)])
 
-        def solve(_: Callable, right: _Motion) -> _Motion:
-            force, change = right
-            acceleration, multipliers = delassus.inverse_inertia @ force, 0.0
+        def solve(of: Callable, right: Array) -> Array:
+            del of
+            acceleration = delassus.inverse_inertia @ right[:count]
+            multipliers = jnp.zeros_like(right[count:])
             # The second pass repairs the round-off of the first, which is large where
             # constraints are nearly dependent.
             for _ in range(2):
-                (more,) = delassus.solve((delassus.product(acceleration) - change)[None])
+                change = delassus.product(acceleration) - right[count:]
+                (more,) = delassus.solve(change[None])
                 acceleration = acceleration - delassus.velocity(more)
                 multipliers = multipliers + more
-            return acceleration, multipliers
+            return jnp.concatenate([acceleration, multipliers])
 
-        right = -slope, -free_rate
-        return jax.lax.custom_linear_solve(product, right, solve, symmetric=True)
+        right = -jnp.concatenate([slope, free_rate])
+        found = jax.lax.custom_linear_solve(product, right, solve, symmetric=True)
+        return found[:count], found[count:]
 
     def _free_joint_acceleration(self, state: State, qdot: Coordinates) -> JointMultipliers:
         """`dpsi/dt` of a motion with constant velocities `v`."""

@@ -9,7 +9,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, TYPE_CHECKING
 
-from . import trigonometry
+from . import addresses, trigonometry
 from .graph import Node, Number, Region
 from .instructions import Instructions, TYPES
 from .loops import Scan, WIDTH
@@ -252,11 +252,18 @@ class Kernel(Instructions):
             return index
         return self._say(f"add i64 {index}, {self._index(first)}")
 
+    def _table(self, number: int) -> str:
+        key = "address", number
+        if key not in self._found:
+            load = addresses.loaded(addresses.table(number))
+            self._found[key] = self._before(lambda: self._say(load))
+        return self._found[key]
+
     def _in_table(self, table: int, k: int) -> str:
         lane = "%i" if k == 0 else self._once(("lane", k), f"add i64 %i, {k}")
         at = self._once(
             ("table", table, k),
-            f"getelementptr i64, ptr inttoptr (i64 $T{table}$ to ptr), i64 {lane}",
+            f"getelementptr i64, ptr {self._table(table)}, i64 {lane}",
         )
         return self._once(("index", table, k), f"load i64, ptr {at}")
 

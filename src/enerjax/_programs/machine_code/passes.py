@@ -5,6 +5,7 @@ that differ between passes. The thread that asks for them works too, and waits o
 threads that have begun: XLA may have none to lend.
 """
 
+from . import addresses
 from .loops import WIDTH
 
 
@@ -12,8 +13,8 @@ _VECTOR = f"<{WIDTH} x double>"
 
 # Numbers of a job: the next pass, how many passes are done, how many threads hold it, and
 # all passes; then the memory and the function for passes from a number on. The offsets in
-# structures of XLA are those of `xla/ffi/api/c_api.h`. `$C$` are the constants, of which
-# `$NUMBER$` are copied, and `$WIDE$` is the size of a memory.
+# structures of XLA are those of `xla/ffi/api/c_api.h`. `$NUMBER$` constants are copied, and
+# `$WIDE$` is the size of a memory.
 PASSES = f"""
 declare i32 @sched_yield()
 
@@ -43,7 +44,8 @@ entry:
   %none = icmp eq ptr %w, null
   br i1 %none, label %end, label %found
 found:
-  call void @widened(ptr inttoptr (i64 $C$ to ptr), ptr %w, i64 $NUMBER$)
+  %c = {addresses.loaded(addresses.CONSTANTS)}
+  call void @widened(ptr %c, ptr %w, i64 $NUMBER$)
   br label %end
 end:
   ret ptr %w

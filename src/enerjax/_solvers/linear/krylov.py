@@ -193,10 +193,13 @@ def jacobian_solver(
     `solve_by_products`.
     """
 
-    # What the exact solvers need, such as the entries of the Jacobian, is computed only
-    # where they are called.
     def otherwise(number: int) -> Map | None:
-        return None if exact is None else lambda right: exact()[number](right)
+        if exact is None:
+            return None
+        solvers = exact
+        # What the exact solvers need, such as the entries of the Jacobian, is computed only
+        # where they are called.
+        return lambda right: solvers()[number](right)
 
     def solve(right: Vector) -> Vector:
         _, push = jax.linearize(fn, x)
