@@ -373,8 +373,11 @@ def first_multipliers(p, q):
 def multipliers_by_elimination(p, q):
     """The same from the equations of motion with a dense matrix."""
     chain, _, args, *_ = ej.problems.chain(3)
+    assert isinstance(chain, ej.System)
     args = args | dict(m=p["m"], g=p["g"])
-    rows = jax.jacrev(lambda q: chain.constraint(q, args))
+    constraint = chain.constraint
+    assert constraint is not None
+    rows = jax.jacrev(lambda q: constraint(q, args))
     slope = jax.grad(lambda q: chain.potential(q, args))(q)
     inertia = jax.hessian(lambda v: chain.kinetic_energy(ej.State(q, v), args))(p["v"])
     _, change = jax.jvp(lambda q: rows(q) @ p["v"], (q,), (p["v"],))
@@ -388,7 +391,7 @@ def test_first_and_second_derivatives_of_the_first_multipliers():
     start = ej.problems.chain(3).start
     p = dict(m=jnp.array([0.5, 0.3, 0.2]), g=jnp.array(9.81), v=start.v + 0.1)
     values, expected = (
-        [transform(fn)(p, start.q) for transform in (jax.value_and_grad, jax.hessian)]
+        [jax.jit(of(fn))(p, start.q) for of in (jax.value_and_grad, jax.hessian)]
         for fn in (first_multipliers, multipliers_by_elimination)
     )
     for x, y in zip(jax.tree.leaves(values), jax.tree.leaves(expected), strict=True):
