@@ -363,18 +363,18 @@ def test_a_derivative_traces_the_search_and_its_rule_once(monkeypatch):
     assert sorted(calls) == ["search", "with_jacobian"]
 
 
-def first_multipliers(p, q):
+def first_multipliers(p):
     """Those of a chain at the start of a run."""
     chain, _, args, *_ = ej.problems.chain(3)
-    start, args = ej.State(q, p["v"]), args | dict(m=p["m"], g=p["g"])
+    start, args = ej.State(p["q"], p["v"]), args | dict(m=p["m"], g=p["g"])
     return jnp.sum(jnp.sin(make_model(chain, start, args).multipliers(start)))
 
 
-def multipliers_by_elimination(p, q):
+def multipliers_by_elimination(p):
     """The same from the equations of motion with a dense matrix."""
     chain, _, args, *_ = ej.problems.chain(3)
     assert isinstance(chain, ej.System)
-    args = args | dict(m=p["m"], g=p["g"])
+    args, q = args | dict(m=p["m"], g=p["g"]), p["q"]
     constraint = chain.constraint
     assert constraint is not None
     rows = jax.jacrev(lambda q: constraint(q, args))
@@ -389,9 +389,9 @@ def multipliers_by_elimination(p, q):
 def test_first_and_second_derivatives_of_the_first_multipliers():
     """They are those of linear equations; see `SeparableModel.accelerations`."""
     start = ej.problems.chain(3).start
-    p = dict(m=jnp.array([0.5, 0.3, 0.2]), g=jnp.array(9.81), v=start.v + 0.1)
+    p = dict(m=jnp.array([0.5, 0.3, 0.2]), g=jnp.array(9.81), q=start.q, v=start.v + 0.1)
     values, expected = (
-        [jax.jit(of(fn))(p, start.q) for of in (jax.value_and_grad, jax.hessian)]
+        [jax.jit(of(fn))(p) for of in (jax.value_and_grad, jax.hessian)]
         for fn in (first_multipliers, multipliers_by_elimination)
     )
     for x, y in zip(jax.tree.leaves(values), jax.tree.leaves(expected), strict=True):
