@@ -43,6 +43,7 @@ def main():
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     counts = dict(graph_of=0, object_of=0)
     counted(library, "graph_of", counts)
+    counted(library, "object_of", counts)
     counted(code_on_disk, "object_of", counts)
     lanes = jnp.linspace(0.1, 0.9, 12).reshape(4, 3)
     outputs = [jax.jit(in_one_function(fn))(lanes[0])]

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from enerjax._programs import in_one_function
 from enerjax._programs.jaxprs import with_constants_as_inputs
 from enerjax._programs.machine_code import code_on_disk
 from enerjax._programs.machine_code.code_on_disk import Code, key_of
@@ -102,17 +103,20 @@ def test_without_a_folder_nothing_is_kept():
     assert key(lambda x: x + 1, 1.0) is None
 
 
-def test_short_compilations_are_not_kept(folder):
-    code = Code(1, ["text"], np.zeros(2, np.int64), [np.arange(3)])
-    least = jax.config.values["jax_persistent_cache_min_compile_time_secs"]
-    code_on_disk.keep_code("short", code, 0.9 * least)
-    assert code_on_disk.kept_code("short") is None
-    code_on_disk.keep_code("long", code, 1.1 * least)
-    found = code_on_disk.kept_code("long")
+def test_code_comes_back_from_disk(folder):
+    code = Code(1, ["text", "branch"], np.zeros(2, np.int64), [np.arange(3)])
+    assert code_on_disk.kept_code("key") is None
+    code_on_disk.keep_code("key", code)
+    found = code_on_disk.kept_code("key")
     assert found is not None
     assert found[:2] == code[:2]
     np.testing.assert_array_equal(found.constants, code.constants)
     np.testing.assert_array_equal(found.tables, code.tables)
+
+
+def test_what_compiles_quickly_is_not_kept(folder):
+    in_one_function(lambda x: 2 * jnp.sin(x))(jnp.ones(3))
+    assert not list(folder.iterdir())
 
 
 def test_a_folder_that_cannot_be_written_is_told(tmp_path, monkeypatch):
@@ -120,5 +124,5 @@ def test_a_folder_that_cannot_be_written_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr(code_on_disk, "_folder", lambda: tmp_path / "file" / "enerjax")
     code = Code(1, ["text"], np.zeros(2, np.int64), [])
     with pytest.warns(UserWarning, match="cannot be kept in .*Choose another folder"):
-        code_on_disk.keep_code("key", code, 10.0)
+        code_on_disk.keep_code("key", code)
     assert code_on_disk.kept_code("key") is None

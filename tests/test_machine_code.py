@@ -1076,9 +1076,9 @@ def test_code_of_a_large_system_hardly_grows_with_its_rows(monkeypatch):
     texts = []
     added = library._Library.added
 
-    def count(self, code):
+    def count(self, code, is_kept):
         texts.append(sum(map(len, code.texts)))
-        return added(self, code)
+        return added(self, code, is_kept)
 
     monkeypatch.setattr(library._Library, "added", count)
     problem = ej.problems.chain(70)

@@ -5,8 +5,9 @@ step, and the calls take longer than the operations. Here a program becomes a gr
 scalar operations (`graph.py`), in which zeros and known numbers are left out, and moving
 entries of arrays (`values.py`) costs nothing. Equal operations on many bodies are loops
 that use vectors, and so are the lanes of a batch (`kernels.py`), which several threads
-share (`passes.py`). LLVM compiles the code (`emission.py`, `handler.py`, `compiler.py`), and
-XLA calls it (`library.py`, `calls.py`). Other processes find it on disk (`code_on_disk.py`).
+share (`passes.py`). LLVM compiles the code (`emission.py`, `handler.py`, `compiler.py`),
+and XLA calls it (`library.py`, `calls.py`). Other processes find it on disk
+(`code_on_disk.py`).
 """
 
 from .calls import (

@@ -10,7 +10,6 @@ import hashlib
 import importlib.metadata
 import os
 import tempfile
-import time
 import warnings
 import zipfile
 import zlib
@@ -54,6 +53,14 @@ def key_of(jaxpr: Any, known: Sequence[np.ndarray | None]) -> str | None:
     return _word(word, _versions(), machine(), *arrays)
 
 
+def is_worth_keeping(seconds: float) -> bool:
+    """Whether a program whose text was found in so many seconds is kept.
+
+    To compile the text takes about as long. JAX is asked for the least sum.
+    """
+    return 2 * seconds >= _config().jax_persistent_cache_min_compile_time_secs
+
+
 def kept_code(key: str) -> Code | None:
     found = _read(f"{key}.npz")
     if found is None:
@@ -66,35 +73,35 @@ def kept_code(key: str) -> Code | None:
     return Code(counts[0], texts, found["constants"], tables)
 
 
-def keep_code(key: str, code: Code, seconds: float) -> None:
-    """Keeps a program that was found in so many seconds."""
+def keep_code(key: str, code: Code) -> None:
     texts = (zlib.compress(x.encode(), 1) for x in code.texts)
     arrays = {f"text{k}": np.frombuffer(x, np.uint8) for k, x in enumerate(texts)}
     arrays |= {f"table{k}": x for k, x in enumerate(code.tables)}
     counts = np.array([code.length, len(code.texts), len(code.tables)])
-    _write(f"{key}.npz", seconds, counts=counts, constants=code.constants, **arrays)
+    _write(f"{key}.npz", counts=counts, constants=code.constants, **arrays)
 
 
 def kept_object(text: str) -> bytes:
-    """The machine code of a module, which is compiled if it is not kept."""
-    if _folder() is None:
-        return object_of(text)
+    """The machine code of a module of a program that is kept."""
     name = f"{_word(text, machine())}.npz"
     found = _read(name)
     if found is not None:
         return found["code"].tobytes()
-    begin = time.perf_counter()
     code = object_of(text)
-    _write(name, time.perf_counter() - begin, code=np.frombuffer(code, np.uint8))
+    _write(name, code=np.frombuffer(code, np.uint8))
     return code
 
 
 # Files ------------------------------------------------------------------------------------
 
 
+def _config() -> Any:
+    return jax.config
+
+
 def _folder() -> Path | None:
     """The folder, if there is one on this computer."""
-    config: Any = jax.config
+    config = _config()
     name = config.jax_compilation_cache_dir
     if not name or not config.jax_enable_compilation_cache or "://" in str(name):
         return None
@@ -104,7 +111,8 @@ def _folder() -> Path | None:
 def _read(name: str) -> dict[str, np.ndarray] | None:
     """The arrays of a file, if there is one, and if it is whole."""
     folder = _folder()
-    assert folder is not None
+    if folder is None:
+        return None
     try:
         with np.load(folder / name, allow_pickle=False) as file:
             return dict(file)
@@ -112,11 +120,10 @@ def _read(name: str) -> dict[str, np.ndarray] | None:
         return None
 
 
-def _write(name: str, seconds: float, **arrays: np.ndarray) -> None:
-    """Writes a file in one piece, if it saves as many seconds as JAX is asked for."""
-    folder, config = _folder(), jax.config
-    least = config.jax_persistent_cache_min_compile_time_secs  # pyright: ignore
-    if folder is None or seconds < least:
+def _write(name: str, **arrays: np.ndarray) -> None:
+    """Writes a file in one piece."""
+    folder = _folder()
+    if folder is None:
         return
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -16,8 +16,15 @@ import jax
 import numpy as np
 
 from . import addresses
-from .code_on_disk import Code, keep_code, kept_code, kept_object, key_of
-from .compiler import loaded
+from .code_on_disk import (
+    Code,
+    is_worth_keeping,
+    keep_code,
+    kept_code,
+    kept_object,
+    key_of,
+)
+from .compiler import loaded, object_of
 from .emission import Emission
 from .evaluation import Evaluation, rows_of_vectors
 from .handler import texts_of
@@ -51,12 +58,14 @@ def compiled_function(jaxpr: Any, known: Sequence[np.ndarray | None]) -> Functio
     """
     key = key_of(jaxpr, known)
     code = None if key is None else kept_code(key)
+    is_kept = code is not None
     if code is None:
         begin = time.perf_counter()
         code = _code_of(*graph_of(jaxpr, known))
-        if key is not None:
-            keep_code(key, code, time.perf_counter() - begin)
-    return Function(_library().added(code), code.length)
+        if key is not None and is_worth_keeping(time.perf_counter() - begin):
+            keep_code(key, code)
+            is_kept = True
+    return Function(_library().added(code, is_kept), code.length)
 
 
 def graph_of(jaxpr: Any, known: Sequence[np.ndarray | None]) -> tuple[Cellar, list, list]:
@@ -115,7 +124,8 @@ class _Compiled:
     Branches that are compiled when they are first taken are kept as text until then.
     """
 
-    def __init__(self, code: Code):
+    def __init__(self, code: Code, is_kept: bool):
+        self._is_kept = is_kept
         self._branches = np.zeros(len(code.texts), np.uintp)
         self._compile = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_int64)(self._branch)
         self._lock = threading.Lock()
@@ -160,7 +170,7 @@ class _Compiled:
     def _address(self, text: str, name: str) -> int:
         """Where the function of this name is."""
         # Only the code stays in memory, and not the text that it was made of.
-        engine = loaded(kept_object(text))
+        engine = loaded(kept_object(text) if self._is_kept else object_of(text))
         self._engines.append(engine)
         to = engine.get_global_value_address("addresses")
         ctypes.memmove(to, self._addresses.ctypes.data, self._addresses.nbytes)
@@ -173,14 +183,17 @@ class _Library:
     def __init__(self):
         self._kept: dict[str, _Compiled] = {}
 
-    def added(self, code: Code) -> str:
-        """The name under which XLA calls a program, which is compiled if it is new."""
+    def added(self, code: Code, is_kept: bool) -> str:
+        """The name under which XLA calls a program, which is compiled if it is new.
+
+        If its text is kept on disk, so is its machine code.
+        """
         digest = hashlib.sha256("".join(code.texts).encode())
         for x in (code.constants, *code.tables):
             digest.update(x.tobytes())
         name = f"enerjax_{digest.hexdigest()[:32]}"
         if name not in self._kept:
-            compiled = self._kept[name] = _Compiled(code)
+            compiled = self._kept[name] = _Compiled(code, is_kept)
             capsule = jax.ffi.pycapsule(ctypes.c_void_p(compiled.address))
             jax.ffi.register_ffi_target(name, capsule, platform="cpu")
         return name
