@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from ..._programs import at_places, Indices, is_known, jacobian_pattern
 from ..._types import Flag
+from .dense import definite_inverse
 
 
 # The largest block size for which a matrix is stored in blocks, and the size up to which a
@@ -104,7 +105,7 @@ def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     # rounding errors, whatever the ratios of their entries are.
     root = jnp.sqrt(diagonal_of(matrix))
     scale = jnp.outer(root, root)
-    return jnp.linalg.inv(matrix / scale) / scale
+    return definite_inverse(matrix / scale) / scale
 
 
 def padded(matrix: Symmetric, count: int) -> Symmetric:

@@ -263,8 +263,11 @@ def solve_definite(
     return _solve_definite(matrix, right)
 
 
+@jax.custom_jvp
 def definite_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """The inverse of a symmetric positive definite matrix, without pivoting."""
+    if matrix.shape[0] > SMALL:
+        return jnp.linalg.inv(matrix)
     order = np.arange(matrix.shape[0])
 
     def column(k: Any, matrix: Array) -> Array:
@@ -278,6 +281,13 @@ def definite_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     if order.size > _UNROLLED_IF_DEFINITE:
         return jax.lax.fori_loop(0, order.size, column, matrix)
     return functools.reduce(lambda matrix, k: column(k, matrix), order, matrix)
+
+
+@definite_inverse.defjvp
+def _definite_inverse_jvp(primals, tangents):
+    (x,), (dx,) = primals, tangents
+    y = definite_inverse(x)
+    return y, -product(product(y, dx), y)
 
 
 @jax.custom_jvp
