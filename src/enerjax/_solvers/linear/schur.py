@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from ..._programs import (
     at_places,
+    call_traced_once,
     Indices,
     jacobian_pattern,
     shape_of,
@@ -245,8 +246,13 @@ class Schur(eqx.Module):
 
     def solve(self, right: Float[Array, "k rows"]) -> Float[Array, "k rows"]:
         """`G^-1` times each of `k` vectors."""
-        solve = self.tables.elimination.solve
-        return jax.vmap(lambda x: solve(self.factors, x))(right)
+        return call_traced_once(_solved, self.tables, self.factors, right)
+
+
+def _solved(
+    tables: SchurTables, factors: Factors, right: Float[Array, "k rows"]
+) -> Float[Array, "k rows"]:
+    return jax.vmap(lambda x: tables.elimination.solve(factors, x))(right)
 
 
 def schur_tables(
@@ -295,7 +301,11 @@ def schur(
     entries = _entries(tables, rows, weighted)
     if regularisation is not None:
         entries = entries.at[tables.diagonal].add(regularisation)
-    return Schur(tables, rows, tables.elimination.factorised(entries))
+    return Schur(tables, rows, call_traced_once(_factorised, tables, entries))
+
+
+def _factorised(tables: SchurTables, entries: Float[Array, " entries"]) -> Factors:
+    return tables.elimination.factorised(entries)
 
 
 def _weighted(
