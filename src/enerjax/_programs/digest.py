@@ -91,7 +91,7 @@ class _Reader:
 
         for const in consts:
             self._tell(checksum([const]))
-        self._tell(list(map(typed, (*jaxpr.constvars, *jaxpr.invars))))
+        self._tell(list(map(typed, (*jaxpr.constvars, *jaxpr.invars))), len(jaxpr.eqns))
         for eqn in jaxpr.eqns:
             self._tell(eqn.primitive.name, list(map(name, eqn.invars)))
             for key in sorted(eqn.params):
@@ -108,6 +108,7 @@ class _Reader:
         elif isinstance(value, Jaxpr):
             self._read(value, ())
         elif isinstance(value, tuple | list):
+            self._tell(len(value))
             for part in value:
                 self._parameter(part)
         elif isinstance(value, dict):
