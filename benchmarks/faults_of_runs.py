@@ -46,6 +46,14 @@ FAULTS = (
         of("gradients::test_first_and_second_derivatives_of_the_first_multipliers"),
     ),
     Fault(
+        "compilation: searches for garbage come back too early",
+        "_programs/garbage.py",
+        "            if not _usual:\n                gc.set_threshold(*usual)\n",
+        "            gc.set_threshold(*usual)\n",
+        "Searches are frequent again after the first program within another one.",
+        of("garbage::test_the_settings_come_back_after_an_error"),
+    ),
+    Fault(
         "code on disk: known inputs are not told",
         "_programs/machine_code/code_on_disk.py",
         "    return _word(word, _versions(), machine(), *arrays)\n",

@@ -12,6 +12,7 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array, PyTree
 
+from .garbage import few_searches_for_garbage
 from .jaxprs import is_known
 from .machine_code.calls import left_to_xla
 
@@ -54,7 +55,8 @@ def _compiled(
     def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Value:
         # Some transformations of JAX set the mesh of devices, also where there is none. It
         # traces what it has traced under another mesh again.
-        with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
+        mesh = jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh())
+        with mesh, few_searches_for_garbage():
             return choose(*args, **kwargs)
 
     def choose(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Value:
@@ -80,6 +82,7 @@ class Readable:
     def __init__(self, fn: Callable[..., PyTree[Array]]):
         self._fn = fn
 
+    @few_searches_for_garbage()
     def __call__(self, *args: Any) -> PyTree[Array]:
         return self._jitted(*_parts(args))
 

@@ -20,6 +20,7 @@ from jax.interpreters import ad, batching, mlir
 from jax.interpreters.partial_eval import dce_jaxpr_consts
 from jaxtyping import Array, PyTree
 
+from ..garbage import few_searches_for_garbage
 from ..jaxprs import known_numbers, with_constants_as_inputs
 from ..known_indices import known_indices
 from .evaluation import NAME
@@ -134,6 +135,7 @@ class Program:
         return ONE_FUNCTION.bind(*numbers, program=self)
 
     @functools.cached_property
+    @few_searches_for_garbage()
     def function(self) -> Function | Unsupported:
         """The function of machine code, or the reason why there is none."""
         if jaxlib.version.__version_info__ < _SINCE:
@@ -247,6 +249,7 @@ def _has_rate(tangent: Any) -> bool:
     return not isinstance(tangent, ad.Zero)
 
 
+@few_searches_for_garbage()
 def _jvp(primals: Any, tangents: Any, *, program: Program) -> tuple[list, list]:
     """Values in one function, with the residuals of the linearisation; rates in another."""
     has_tangent = list(map(_has_rate, tangents))
@@ -285,6 +288,7 @@ def _depends(closed: ClosedJaxpr, linear: int) -> list[bool]:
     return [id(x) in on for x in jaxpr.outvars]
 
 
+@few_searches_for_garbage()
 def _transpose(cotangents: Any, *numbers: Any, program: Program) -> list:
     wanted = [ad.is_undefined_primal(x) for x in numbers]
     unknown, known = _split(wanted, numbers)
