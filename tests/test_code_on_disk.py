@@ -98,6 +98,12 @@ def test_a_program_that_cannot_be_compared_has_no_key(folder):
     assert key_of(unknown, [None]) is None
 
 
+def test_a_program_with_a_random_key_has_no_key(folder):
+    state = jax.random.key(3)
+    noise = jax.jit(lambda: jax.random.normal(state, (2,)))
+    assert key(lambda x: x + noise(), jnp.ones(2)) is None
+
+
 def test_without_a_folder_nothing_is_kept():
     assert jax.config.values["jax_compilation_cache_dir"] is None
     assert key(lambda x: x + 1, 1.0) is None
@@ -126,3 +132,13 @@ def test_a_folder_that_cannot_be_written_is_told(tmp_path, monkeypatch):
     with pytest.warns(UserWarning, match="cannot be kept in .*Choose another folder"):
         code_on_disk.keep_code("key", code)
     assert code_on_disk.kept_code("key") is None
+
+
+def test_a_failed_write_leaves_no_file(folder, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.warns(UserWarning, match="No space left"):
+        code_on_disk.keep_code("key", Code(1, ["text"], np.zeros(2, np.int64), []))
+    assert not list(folder.iterdir())

@@ -40,11 +40,13 @@ def digest(traced: ClosedJaxpr) -> str:
 def complete_digest(traced: ClosedJaxpr) -> str | None:
     """`digest(traced)` if it is that of this program alone.
 
-    `None` if the program has traced constants, or parameters of unknown types.
+    `None` if the program has constants without known numbers, such as traced values and
+    random keys, or parameters of unknown types.
     """
     try:
         reader = _Reader(traced)
-    except jax.errors.TracerArrayConversionError:
+    except TypeError:
+        # An array cannot be converted to one of NumPy.
         return None
     return None if reader.has_unknown else reader.word.hexdigest()
 

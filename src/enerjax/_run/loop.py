@@ -358,8 +358,8 @@ def run_loop(
         multipliers=begin.multipliers,
         varying=begin.varying,
     )
-    # The multipliers in the carry count only after a step, and are then others. With rates
-    # they would have derivatives wherever the end of the run has some.
+    # Each step replaces the multipliers in the carry: the first ones need no derivatives.
+    # JAX would compute these in every gradient, because the carry as a whole has some.
     first = begin.state, jax.lax.stop_gradient(begin.multipliers)
     found = lambda x: (x.state, x.multipliers)
     begin = eqx.tree_at(found, begin, moving(first, (stepper, begin)))

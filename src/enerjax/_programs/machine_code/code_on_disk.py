@@ -96,6 +96,7 @@ def kept_object(text: str) -> bytes:
 
 
 def _config() -> Any:
+    # The type of `jax.config` does not name its options.
     return jax.config
 
 
@@ -128,9 +129,9 @@ def _write(name: str, **arrays: np.ndarray) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         # Other processes may write the same file.
-        with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
-            np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
-        os.replace(file.name, folder / name)
+        with tempfile.TemporaryDirectory(dir=folder) as own:
+            np.savez(Path(own) / name, **arrays)  # pyright: ignore[reportArgumentType]
+            os.replace(Path(own) / name, folder / name)
     except OSError as error:
         warnings.warn(
             f"Machine code cannot be kept in {folder} ({error}). The next process compiles "

@@ -265,7 +265,10 @@ def solve_definite(
 
 @jax.custom_jvp
 def definite_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The inverse of a symmetric positive definite matrix, without pivoting."""
+    """The inverse of a symmetric positive definite matrix, for which no pivots are needed.
+
+    Inverses of larger matrices are those of LAPACK.
+    """
     if matrix.shape[0] > SMALL:
         return jnp.linalg.inv(matrix)
     order = np.arange(matrix.shape[0])

@@ -176,7 +176,8 @@ class Linearisable(eqx.Module):
     def constant_solvers(self, x: Float[Array, " n"]) -> tuple[Map, Map]:
         """Functions that solve with the regularised Jacobian at `x` and its transpose.
 
-        They have no derivatives with respect to `x`.
+        They have no derivatives with respect to `x`. If there is a regularisation, the
+        Jacobian must not be small and dense: an explicit inverse would be too inaccurate.
         """
         matrix, form = jax.lax.stop_gradient(self.jacobian(x)), self.form
         if self.is_dense and x.size <= SMALL:

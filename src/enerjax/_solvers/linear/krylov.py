@@ -196,7 +196,7 @@ def jacobian_solver(
     def otherwise(number: int) -> Map | None:
         if exact is None:
             return None
-        solvers = exact
+        solvers = exact  # which is not `None`, also for a type checker
         # What the exact solvers need, such as the entries of the Jacobian, is computed only
         # where they are called.
         return lambda right: solvers()[number](right)
