@@ -51,9 +51,15 @@ def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 @_inverse.defjvp
 def _inverse_jvp(primals, tangents):
-    # Derivatives of any order consist of matrix products alone.
+    return _change_of_inverse(inverse, primals, tangents)
+
+
+def _change_of_inverse(
+    invert: Callable[[Array], Array], primals: Any, tangents: Any
+) -> tuple[Array, Array]:
+    """Derivatives of any order consist of matrix products alone."""
     (x,), (dx,) = primals, tangents
-    y = inverse(x)
+    y = invert(x)
     return y, -product(product(y, dx), y)
 
 
@@ -288,9 +294,7 @@ def definite_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 @definite_inverse.defjvp
 def _definite_inverse_jvp(primals, tangents):
-    (x,), (dx,) = primals, tangents
-    y = definite_inverse(x)
-    return y, -product(product(y, dx), y)
+    return _change_of_inverse(definite_inverse, primals, tangents)
 
 
 @jax.custom_jvp
