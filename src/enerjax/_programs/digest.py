@@ -55,8 +55,8 @@ def complete_digest(traced: ClosedJaxpr) -> str | None:
 # to derive, transpose and batch it.
 _WITHOUT_VALUES = frozenset(
     """
-    AbstractMesh ClosedRule Mesh NamedSharding NoneType PjitFunction PyTreeDef
-    SaveOnlyTheseNames UnspecifiedValue WrappedFun
+    AbstractMesh ClosedRule Mesh NamedSharding NoneType PyTreeDef SaveOnlyTheseNames
+    UnspecifiedValue WrappedFun
     """.split()
 )
 

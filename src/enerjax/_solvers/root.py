@@ -101,10 +101,12 @@ def _change(
     flat, unravel = ravel_pytree(value)
     prepared = part(lambda: chord.prepare(value, args))()
     correct = lambda x: ravel_pytree(chord.correct(unravel(x), args, prepared))[0]
-    by_entries = None
-    if not isinstance(root_finder, ChordAlone):
-        by_entries = lambda: exact.constant_solvers(flat)
-    return jacobian_solver(exact.value, flat, correct, by_entries)(right)
+    if isinstance(root_finder, ChordAlone):
+        return jacobian_solver(exact.value, flat, correct)(right)
+    # The entries of the Jacobian are computed only where one of these is called.
+    by_entries = lambda right: exact.constant_solvers(flat)[0](right)
+    transposed = lambda right: exact.constant_solvers(flat)[1](right)
+    return jacobian_solver(exact.value, flat, correct, by_entries, transposed)(right)
 
 
 def _null_space_rate(

@@ -82,7 +82,7 @@ def keep_code(key: str, code: Code) -> None:
 
 
 def kept_object(text: str) -> bytes:
-    """The machine code of a module of a program that is kept."""
+    """The machine code of a module, from disk, or compiled and kept there."""
     name = f"{_word(text, machine())}.npz"
     found = _read(name)
     if found is not None:

@@ -253,11 +253,8 @@ class Kernel(Instructions):
         return self._say(f"add i64 {index}, {self._index(first)}")
 
     def _table(self, number: int) -> str:
-        key = "address", number
-        if key not in self._found:
-            load = addresses.loaded(addresses.table(number))
-            self._found[key] = self._before(lambda: self._say(load))
-        return self._found[key]
+        load = addresses.loaded(addresses.table(number))
+        return self._before(lambda: self._once(("address", number), load))
 
     def _in_table(self, table: int, k: int) -> str:
         lane = "%i" if k == 0 else self._once(("lane", k), f"add i64 %i, {k}")

@@ -1,7 +1,7 @@
 """Functions with their Jacobians, which are stored as their size and sparsity suggest."""
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -23,10 +23,9 @@ from .block_elimination import BlockElimination, BlockFactors
 from .colours import coloured_products, column_colours
 from .dense import AbstractFactors, Inverse, inverse, LU, SMALL
 from .elimination_order import Owners
+from .krylov import Map
 from .user_solver import AbstractSparseSolver, LineaxFactors, Sparse, SuperLU
 
-
-Map: TypeAlias = Callable[[Float[Array, " n"]], Float[Array, " n"]]
 
 # Equations with more unknowns than this and without `owners` are left to SuperLU.
 _MANY = 256

@@ -184,26 +184,18 @@ def jacobian_solver(
     fn: Map,
     x: Vector,
     approximate: Map,
-    exact: Callable[[], tuple[Map, Map]] | None = None,
+    otherwise: Map | None = None,
+    otherwise_transposed: Map | None = None,
 ) -> Map:
     """A function that solves with the Jacobian of `fn` at `x`, and can be transposed.
 
-    `approximate` is linear and nearly inverts the Jacobian. Where it does not, the first of
-    the functions `exact()` solves, and the second one solves with the transpose; see
-    `solve_by_products`.
+    `approximate` is linear and nearly inverts the Jacobian. Where it does not, `otherwise`
+    solves, and `otherwise_transposed` with the transpose; see `solve_by_products`.
     """
-
-    def otherwise(number: int) -> Map | None:
-        if exact is None:
-            return None
-        solvers = exact  # which is not `None`, also for a type checker
-        # What the exact solvers need, such as the entries of the Jacobian, is computed only
-        # where they are called.
-        return lambda right: solvers()[number](right)
 
     def solve(right: Vector) -> Vector:
         _, push = jax.linearize(fn, x)
-        return solve_by_products(push, approximate, right, otherwise(0))
+        return solve_by_products(push, approximate, right, otherwise)
 
     def transposed(of: Map) -> Map:
         """The transpose of the derivative at `x`, which of a linear map is the map."""
@@ -211,9 +203,8 @@ def jacobian_solver(
         return lambda y: pull(y)[0]
 
     def solve_transposed(right: Vector) -> Vector:
-        return solve_by_products(
-            transposed(fn), transposed(approximate), right, otherwise(1)
-        )
+        products = transposed(fn), transposed(approximate)
+        return solve_by_products(*products, right, otherwise_transposed)
 
     # The products that JAX passes to these have lost the known indices, without which the
     # iterations cannot be one function.
