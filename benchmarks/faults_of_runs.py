@@ -136,6 +136,22 @@ FAULTS = (
         of("chord::test_the_matrix_of_the_multipliers_is_that_of_dense_algebra"),
     ),
     Fault(
+        "rounds: old fill",
+        "_solvers/linear/graph_elimination.py",
+        "        for k in blocked.union(*(near[j] for j in blocked)):\n",
+        "        for k in blocked:\n",
+        "The fill of nodes two couplings from an eliminated one is that of earlier rounds.",
+        of("chord::test_each_round_eliminates_what_causes_the_least_fill"),
+    ),
+    Fault(
+        "rounds: cost nothing",
+        "_solvers/linear/graph_elimination.py",
+        "_ROUND = 3000",
+        "_ROUND = 300",
+        "Long chains in directors take many rounds of few nodes each.",
+        of("explain::test_a_long_chain_in_directors_is_eliminated_in_few_rounds"),
+    ),
+    Fault(
         "blocks: derivative by the matrix",
         "_solvers/linear/independent_blocks.py",
         "dright - _times(dblocks, x)",

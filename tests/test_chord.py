@@ -26,6 +26,7 @@ from enerjax._run.prediction import (
 )
 from enerjax._solvers import Chord, find_root, Newton, schur, schur_tables
 from enerjax._solvers.linear.block_diagonal import in_blocks
+from enerjax._solvers.linear.graph_elimination import elimination_order
 from enerjax._solvers.linear.krylov import jacobian_solver
 
 from .helpers import EPS, long, SCHEMES
@@ -623,6 +624,34 @@ def test_springs_do_not_need_newton_however_stiff_they_are(searched_by):
     assert "3 of the rows are those of strains" in str(
         ej.explain(system, ej.EnergyPreserving(), start, args)
     )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_each_round_eliminates_what_causes_the_least_fill(seed):
+    draw, count = np.random.default_rng(seed), 40
+    coupled = np.tril(draw.random((count, count)) < 0.06, -1)
+    coupled = coupled | coupled.T
+    adjacent = [set(np.flatnonzero(row).tolist()) for row in coupled]
+    order = elimination_order([np.array([k]) for k in range(count)], adjacent)
+    assert order is not None
+
+    def fill(k):
+        near = np.flatnonzero(coupled[k])
+        pairs = np.tril_indices(near.size, -1)
+        return np.count_nonzero(~coupled[np.ix_(near, near)][pairs])
+
+    left = set(range(count))
+    for of in order.rounds:
+        least = max(1, min(map(fill, left)))
+        assert max(map(fill, of.nodes)) <= least
+        for k, neighbours in zip(of.nodes, of.neighbours, strict=True):
+            assert neighbours == np.flatnonzero(coupled[k]).tolist()
+        for k in of.nodes:
+            near = np.flatnonzero(coupled[k])
+            coupled[np.ix_(near, near)] = ~np.eye(near.size, dtype=bool)
+            coupled[k], coupled[:, k] = False, False
+        left -= set(of.nodes)
+    assert sorted(left) == order.left
 
 
 def test_the_stiffness_of_a_net_is_left_to_newton():

@@ -4,6 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import pytest
+import space_mechanisms as space
 
 import enerjax as ej
 
@@ -78,6 +79,15 @@ def test_of_a_chain_every_other_row_is_eliminated():
     rounds = "24 rows, nodes eliminated together: 12, 6, 3; then 3 rows"
     assert found.chord.startswith(rounds)
     assert "nodes of up to 4 unknowns" in found.jacobian
+
+
+def test_a_long_chain_in_directors_is_eliminated_in_few_rounds():
+    """Node by node from both ends it would take 60 rounds, and long to compile."""
+    system, start, args = space.chain(24).scene().build()
+    found = ej.explain(system, ej.Rattle(), start, args)
+    assert found.chord is not None
+    rounds, _ = found.chord.removeprefix("264 rows, nodes eliminated together: ").split(";")
+    assert len(rounds.split(",")) <= 5  # about the logarithm of the 25 blocks
 
 
 def test_a_sparse_solver_replaces_the_chord_method():

@@ -278,10 +278,11 @@ def schur_tables(
     if bounds is not None and not segments.are_within(bounds):
         return None
     most_rounds = np.inf if bounds is None else bounds.rounds
-    orders = [x for x in segments.orders(most_rounds) if x is not None]
-    order = min(orders, key=lambda x: x.cost, default=None)
-    if order is None or order.width > _WIDEST:
+    found = (x for x in segments.orders(most_rounds) if x is not None)
+    orders = [x for x in found if x.width <= _WIDEST]
+    if not orders:
         return None
+    order = min(orders, key=lambda x: x.cost)
     if colours is None:
         colours = column_colours(pattern, np.arange(like.size))
     return SchurTables(pattern, segments, order, colours)
