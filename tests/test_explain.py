@@ -82,7 +82,7 @@ def test_of_a_chain_every_other_row_is_eliminated():
 
 
 def test_a_long_chain_in_directors_is_eliminated_in_few_rounds():
-    """Node by node from both ends it would take 60 rounds, and long to compile."""
+    """From both ends, two nodes in a round, it would take about 60 rounds."""
     system, start, args = space.chain(24).scene().build()
     found = ej.explain(system, ej.Rattle(), start, args)
     assert found.chord is not None

@@ -24,7 +24,8 @@ _CODES = {"f8": "double", "f4": "float", "b1": "i8"} | {
 def texts_of(emission: Emission, inputs: list, outputs: list) -> list[str]:
     """The modules of a program: the one with the handler, and one for each branch that is
     compiled when it is first taken."""
-    # These come first, because they add tables, and the modules need the number of all.
+    # The copies come first, because they add tables, and the modules need the number of all
+    # tables.
     copies = _copies(emission, inputs, outputs)
     # One more, because kernels may read the cell behind a number.
     size = 8 * (emission.cellar.num_constants + emission.cellar.size + 1)

@@ -278,11 +278,11 @@ def schur_tables(
     if bounds is not None and not segments.are_within(bounds):
         return None
     most_rounds = np.inf if bounds is None else bounds.rounds
-    found = (x for x in segments.orders(most_rounds) if x is not None)
-    orders = [x for x in found if x.width <= _WIDEST]
-    if not orders:
+    orders = (x for x in segments.orders(most_rounds) if x is not None)
+    narrow = (x for x in orders if x.width <= _WIDEST)
+    order = min(narrow, key=lambda x: x.cost, default=None)
+    if order is None:
         return None
-    order = min(orders, key=lambda x: x.cost)
     if colours is None:
         colours = column_colours(pattern, np.arange(like.size))
     return SchurTables(pattern, segments, order, colours)
