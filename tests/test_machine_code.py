@@ -716,9 +716,9 @@ def test_loops_do_not_gather_what_they_do_not_change():
 
     closed = jax.make_jaxpr(fn)(table)
     known = [*map(np.asarray, closed.consts), None]
-    cellar, _, _ = library.graph_of(closed.jaxpr, known)
+    cellar, _, outputs = library.graph_of(closed.jaxpr, known)
     regions = list(scheduling.all_regions(cellar.graph.root))
-    kernels = scheduling.kernels_of(cellar.graph, regions)
+    kernels = scheduling.kernels_of(cellar, regions, [places for _, places in outputs])
     gathers = [
         region.depth
         for (region, *_), nodes in kernels.items()

@@ -18,7 +18,7 @@ _LARGE_BRANCH = 1_000
 
 
 class Emission:
-    """The code of a program.
+    """The code of a program, whose results are in the cells `outputs`.
 
     - `functions`: the kernels, and `@main`, which has the loops and branches, by name.
     - `late`: for each branch that is compiled when it is first taken, its kernels and
@@ -27,7 +27,7 @@ class Emission:
     - `length`: the number of operations.
     """
 
-    def __init__(self, cellar: Cellar):
+    def __init__(self, cellar: Cellar, outputs: Sequence[np.ndarray]):
         self.cellar, self._root = cellar, cellar.graph.root
         self.functions: dict[str, str] = {}
         self.late: list[dict[str, str]] = []
@@ -43,7 +43,7 @@ class Emission:
             if isinstance(item, Scan) and not item.is_wide
         }
         self.has_passes = any(region.is_wide for region in regions)
-        kernels = kernels_of(cellar.graph, regions)
+        kernels = kernels_of(cellar, regions, outputs)
         self.length = sum(map(len, kernels.values()))
         loops = recurrences(regions, kernels, scheduling.LONGEST)
         self._make_places(kernels, loops)

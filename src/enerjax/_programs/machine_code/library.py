@@ -110,7 +110,7 @@ def graph_of(jaxpr: Any, known: Sequence[np.ndarray | None]) -> tuple[Cellar, li
 
 
 def _code_of(cellar: Cellar, inputs: list, outputs: list) -> Code:
-    emission = Emission(cellar)
+    emission = Emission(cellar, [places for _, places in outputs if places is not None])
     texts = texts_of(emission, inputs, outputs)
     constants = np.concatenate([np.zeros(0, np.int64), *cellar.constants])
     # Tables of distances have no constants' cells.

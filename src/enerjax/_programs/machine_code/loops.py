@@ -61,6 +61,11 @@ class Scan:
         self.level = 0
 
     @property
+    def places(self) -> list[int]:
+        """The cells that decide what is run."""
+        return [self.counter]
+
+    @property
     def regions(self) -> list[Region]:
         return [self.body]
 
@@ -77,6 +82,10 @@ class While:
         self.level = 0
 
     @property
+    def places(self) -> list[int]:
+        return [self.flag]
+
+    @property
     def regions(self) -> list[Region]:
         return [self.head, self.before, self.body]
 
@@ -90,6 +99,10 @@ class Branch:
     def __init__(self, branches: list[Region], which: int, marker: Node):
         self.branches, self.which, self.marker = branches, which, marker
         self.level = 0
+
+    @property
+    def places(self) -> list[int]:
+        return [self.which]
 
     @property
     def regions(self) -> list[Region]:

@@ -5,16 +5,21 @@ kernels and reads to earlier ones where that makes less to write and to read.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+
+import numpy as np
 
 from .graph import Graph, Node, NOT_COMPUTED, Region
 from .loops import Branch, Scan, While
+from .values import Block, Cellar
 
 
 # Kernels of single numbers with more operations are divided: the time of compilation grows
 # faster than their length. It grows most for loops over lanes. Those that run once and have
 # few lanes are divided too; for the rows of a run it would take longer to write and read.
 LONGEST, _LONGEST_OF_LANES, _FEW_LANES = 2_500, 300, 256
+# The operands by which operations find cells.
+_OFFSETS = {"dynamic": slice(0, 1), "store": slice(1, None)}
 # The longest chain of operations that moves to a later kernel with the last of them.
 _LONGEST_SUNK = 8
 
@@ -34,23 +39,13 @@ def _longest(node: Node) -> float:
     return _LONGEST_OF_LANES if is_divided else math.inf
 
 
-def kernels_of(graph: Graph, regions: list[Region]) -> dict[tuple, list[Node]]:
-    """The operations that are needed, by kernel."""
-    live: set[Node] = set()
-    stack = [
-        x
-        for region in regions
-        for x in region.nodes
-        if x.op == "store" or (x.place is not None)
-    ]
-    while stack:
-        node = stack.pop()
-        if node in live:
-            continue
-        live.add(node)
-        stack.extend(x for x in node.operands if isinstance(x, Node) and x not in live)
+def kernels_of(
+    cellar: Cellar, regions: list[Region], outputs: Sequence[np.ndarray]
+) -> dict[tuple, list[Node]]:
+    """The operations that are needed, by kernel, for the numbers in the cells `outputs`."""
+    live = _live(cellar, regions, outputs)
     _sink(live)
-    _copy_scattered(graph, live, regions)
+    _copy_scattered(cellar.graph, live, regions)
     order = {region: k for k, region in enumerate(regions)}
     needed = [x for x in live if x.op not in NOT_COMPUTED and x.region in order]
     # Loops over lanes that are divided write last, when all that they read is read.
@@ -67,6 +62,44 @@ def kernels_of(graph: Graph, regions: list[Region]) -> dict[tuple, list[Node]]:
             part = parts[key] = part + 1
         kernels.setdefault((*key, part), []).append(node)
     return kernels
+
+
+def _live(
+    cellar: Cellar, regions: list[Region], outputs: Sequence[np.ndarray]
+) -> set[Node]:
+    """The operations whose results are needed.
+
+    Results that no operation reads from the memory lose their cells there: arrays are given
+    cells as soon as they are joined to others, for example.
+    """
+    live: set[Node] = set()
+    read: set[Node | Block] = set(cellar.read_at_computed_places)
+    for places in outputs:
+        read.update(cellar.owners(places))
+    for region in regions:
+        for item in region.items:
+            read.update(cellar.owners(np.array(item.places, np.int64)))
+    stack = [x for region in regions for x in region.nodes if x.op == "store"]
+    stack.extend(x for x in read if isinstance(x, Node))
+    while stack:
+        node = stack.pop()
+        if node in live:
+            continue
+        live.add(node)
+        stack.extend(x for x in node.operands if isinstance(x, Node) and x not in live)
+        if node.op == "load":
+            owners = cellar.owners(cellar.loaded_places(node))
+        else:
+            # Where an array begins is read from the memory.
+            first = node.operands[_OFFSETS[node.op]] if node.op in _OFFSETS else ()
+            owners = [x for x in first if isinstance(x, Node)]
+        read.update(owners)
+        stack.extend(x for x in owners if isinstance(x, Node))
+    for region in regions:
+        for node in region.nodes:
+            if node.place is not None and node not in read:
+                node.place = None
+    return live
 
 
 def _sink(live: set[Node]) -> None:

@@ -151,6 +151,8 @@ class Cellar:
         # The first cells and the lanes of the owners, for many cells at once, with room for
         # more owners.
         self._owner_table = np.zeros((2, 64), np.int64)
+        # The owners of arrays in which places are computed.
+        self.read_at_computed_places: set[Node | Block] = set()
         # Whether some cells have a number for each of several passes.
         self.has_passes = False
         self._read_before: dict[tuple[bytes, str], Number] = {}
@@ -223,6 +225,8 @@ class Cellar:
         return np.full(n, self.place_of(x, dtype))
 
     def loaded_places(self, x: Node) -> np.ndarray:
+        if not x.lanes:
+            return np.array([x.extra])
         first, stride, table = x.extra
         if table is not None:
             return (first or 0) + self.tables[table]
@@ -316,7 +320,7 @@ class Cellar:
             cells = [self._cell_of_constant(int(p)) for p in places]
             places = self._constants_at(np.array(cells))
             first, stride, is_affine = int(places[0]), 1, True
-        owners = self._all_owners(places)
+        owners = self.owners(places)
         for owner in owners:
             if isinstance(owner, Node) and is_affine and stride == 1:
                 if owner.place == first and owner.lanes == n and not owner.is_reduced:
@@ -339,7 +343,7 @@ class Cellar:
         inner = places[1:-1]
         whole = np.arange(inner[0] - 1, inner[-1] + 2)
         # The cell before the first one belongs to another number, which is not used.
-        region, level, markers = self._readable(self._all_owners(inner))
+        region, level, markers = self._readable(self.owners(inner))
         extra = (int(whole[0]), 1, None)
         x: Number = self.graph.at(region, level, "load", dtype, markers, extra, places.size)
         lane = self.graph.at(self.graph.root, 0, "lane", "i8", lanes=places.size)
@@ -354,7 +358,7 @@ class Cellar:
         """The cells, or copies, such that all or none have a number for each pass."""
         if not self.has_passes:
             return places
-        owners = self._all_owners(places.ravel())
+        owners = self.owners(places.ravel())
         if len({x.region.is_wide for x in owners}) < 2:
             return places
         region = self._outermost_of_passes()
@@ -372,7 +376,9 @@ class Cellar:
 
         A marker stands for the level from which cells of a region around it can be read.
         """
-        return self._readable(self._all_owners(places.ravel()), by_lanes=False)
+        owners = self.owners(places.ravel())
+        self.read_at_computed_places.update(owners)
+        return self._readable(owners, by_lanes=False)
 
     def _readable(
         self, owners: list[Any], by_lanes: bool = True
@@ -428,7 +434,8 @@ class Cellar:
             return None
         return whole, others
 
-    def _all_owners(self, places: np.ndarray) -> list[Node | Block]:
+    def owners(self, places: np.ndarray) -> list[Node | Block]:
+        """Who owns these cells, apart from constants."""
         last = int(places.max(initial=-1))
         if last >= CONSTANTS:
             places = places[places < CONSTANTS]

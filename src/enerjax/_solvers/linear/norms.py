@@ -5,8 +5,8 @@ from jaxtyping import Array, Float
 from ..._types import Scalar
 
 
-# The number of pieces of an array that are compared entry by entry first.
-_PIECES = 16
+# Of arrays with more entries, so many pieces are compared entry by entry first.
+_LARGE, _PIECES = 2048, 16
 
 
 def largest(x: Float[Array, "*shape"]) -> Scalar:
@@ -25,7 +25,7 @@ def largest(x: Float[Array, "*shape"]) -> Scalar:
     bits = bits & jnp.iinfo(integer).max
     # XLA does not vectorise a reduction to a single number.
     width = -(-bits.size // _PIECES)
-    if width > 1:
+    if bits.size > _LARGE:
         bits = jnp.max(jnp.pad(bits, (0, -bits.size % width)).reshape(-1, width), axis=0)
     found = jax.lax.bitcast_convert_type(jnp.max(bits, initial=0), x.dtype)
     return jnp.where(jnp.isnan(found), jnp.inf, found)
