@@ -47,6 +47,8 @@ class Emission:
         self.length = sum(map(len, kernels.values()))
         loops = recurrences(regions, kernels, scheduling.LONGEST)
         self._make_places(kernels, loops)
+        # The cells behind the constants begin with a line of the cache, too.
+        cellar.align_constants()
         self._recurrences = {}
         self._texts: dict[Region, dict[str, str]] = {region: {} for region in regions}
         self._sizes: dict[Region, int] = dict.fromkeys(regions, 0)

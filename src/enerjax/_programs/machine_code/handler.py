@@ -27,8 +27,9 @@ def texts_of(emission: Emission, inputs: list, outputs: list) -> list[str]:
     # The copies come first, because they add tables, and the modules need the number of all
     # tables.
     copies = _copies(emission, inputs, outputs)
-    # One more, because kernels may read the cell behind a number.
-    size = 8 * (emission.cellar.num_constants + emission.cellar.size + 1)
+    # One more, because kernels may read the cell behind a number, and a line of the cache,
+    # because the memory begins with the first whole one.
+    size = 8 * (emission.cellar.num_constants + emission.cellar.size + 1) + 64
     handler = (PASSES if emission.has_passes else _WITHOUT_PASSES) + _HANDLER
     has_large_pages = sys.platform == "linux" and size >= _LARGE
     num_constants = sum(map(len, emission.cellar.constants))
@@ -168,7 +169,7 @@ def _helpers() -> str:
 # Without them, the steps of large systems read from more pages than the processor can look
 # up quickly.
 _WITH_LARGE_PAGES = """
-  %begin = ptrtoint ptr %m to i64
+  %begin = ptrtoint ptr %all to i64
   %after = add i64 %begin, 4095
   %first = and i64 %after, -4096
   %stop = add i64 %begin, $SIZE$
@@ -209,7 +210,11 @@ answer:
   store i64 %version, ptr %a3
   ret ptr null
 work:
-  %m = call ptr @malloc(i64 $SIZE$)$LARGE_PAGES$
+  %all = call ptr @malloc(i64 $SIZE$)$LARGE_PAGES$
+  %all_begin = ptrtoint ptr %all to i64
+  %all_after = add i64 %all_begin, 63
+  %line = and i64 %all_after, -64
+  %m = inttoptr i64 %line to ptr
   %c = {addresses.loaded(addresses.CONSTANTS)}
   call void @llvm.memcpy.p0.p0.i64(ptr %m, ptr %c, i64 $CONSTANTS$, i1 false)
   %w = call ptr @passes_memory()
@@ -220,7 +225,7 @@ work:
 $COPIES_IN$
   call void @main(ptr %frame, ptr %m, ptr %w)
 $COPIES_OUT$
-  call void @free(ptr %m)
+  call void @free(ptr %all)
   call void @free(ptr %w)
   ret ptr null
 }}

@@ -244,7 +244,6 @@ def _block(
     """
     shape, region = value.shape, self.graph.current
     size, places = math.prod(shape), np.zeros(math.prod(shape), np.int64)
-    first = self.cellar.size
     parts: list[np.ndarray] = []
     if isinstance(value, Cells) and value.lane is not None:
         parts = list(columns_along(np.arange(size).reshape(shape), value.lane))
@@ -264,17 +263,16 @@ def _block(
             parts = [np.arange(size)]
         else:
             parts = list(columns_along(np.arange(size).reshape(shape), lane))
-    owners = []
-    whole = np.concatenate(parts)
-    places[whole] = first + np.arange(size)
     if copies > 1:
         sizes = {part.size for part in parts}
-        owners.append(Block(region, 0, sizes.pop() if len(sizes) == 1 else 1))
-        self.cellar.new(copies * size, owners[0])
-    else:
-        for part in parts:
-            owners.append(Block(region, 0, part.size))
-            self.cellar.new(part.size, owners[-1])
+        owner = Block(region, 0, sizes.pop() if len(sizes) == 1 else 1)
+        first = self.cellar.new(copies * size, owner)
+        places[np.concatenate(parts)] = first + np.arange(size)
+        return [owner], places.reshape(shape)
+    owners = []
+    for part in parts:
+        owners.append(Block(region, 0, part.size))
+        places[part] = self.cellar.new(part.size, owners[-1]) + np.arange(part.size)
     return owners, places.reshape(shape)
 
 

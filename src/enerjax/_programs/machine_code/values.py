@@ -123,6 +123,15 @@ _LINE = 8
 _LONG = 64
 
 
+def _next_line(place: int) -> int:
+    """The next cell with which a line begins, from a cell on.
+
+    Numbers of lanes begin there, because several of them are read at once, and two lines
+    for one read take twice as long.
+    """
+    return -(-place // _LINE) * _LINE
+
+
 def _distance(count: int) -> int:
     """The distance to the next lanes, in cells: an odd number of lines.
 
@@ -164,6 +173,8 @@ class Cellar:
 
     def new(self, count: int, owner: Node | Block) -> int:
         """The first of so many new cells."""
+        if count >= _FEWEST_LANES:
+            self.size = _next_line(self.size)
         last = len(self._owners)
         self._starts.append(self.size)
         self._owners.append(owner)
@@ -172,7 +183,7 @@ class Cellar:
             self._owner_table = np.concatenate([table, np.zeros_like(table)], axis=1)
         is_reduced = isinstance(owner, Node) and owner.is_reduced
         self._owner_table[:, last] = self.size, 1 if is_reduced else owner.lanes or 1
-        self.size += count
+        self.size += count if count < _LONG else _distance(count)
         return self._starts[-1]
 
     def hand_over(self, owners: list["Block"], region: Region, ready: int) -> None:
@@ -211,10 +222,7 @@ class Cellar:
         if x.op == "load" and not x.lanes:
             return x.extra
         if x.place is None:
-            count = 1 if x.is_reduced or not x.lanes else x.lanes
-            x.place = self.new(count, x)
-            if count >= _LONG:
-                self.size = x.place + _distance(count)
+            x.place = self.new(1 if x.is_reduced or not x.lanes else x.lanes, x)
         return x.place
 
     def places_of_lanes(self, x: Number, dtype: str, n: int) -> np.ndarray:
@@ -232,7 +240,16 @@ class Cellar:
             return (first or 0) + self.tables[table]
         return first + stride * np.arange(x.lanes)
 
+    def align_constants(self) -> None:
+        """Adds cells up to the next line of the cache."""
+        added = _next_line(self.num_constants) - self.num_constants
+        self.constants.append(np.zeros(added, np.int64))
+        self._constant_starts.append(self.num_constants)
+        self.num_constants += added
+
     def _new_constants(self, cells: np.ndarray) -> int:
+        if cells.size >= _FEWEST_LANES:
+            self.align_constants()
         place = CONSTANTS + self.num_constants
         self._constant_starts.append(self.num_constants)
         self.constants.append(cells)
