@@ -614,7 +614,7 @@ def _term_size(
     parts = np.random.default_rng(0).uniform(0.5, 1.5, (_DRAWS, flat.size))
     parts = jax.vmap(unravel)(jnp.asarray(parts, flat.dtype))
     # One array after the other: those of `args` are the same in all steps.
-    moved = jax.tree.map(jnp.multiply, parts, inputs)
+    moved = jax.tree.map(lambda part, x: part * x[None], parts, inputs)
     value, change_by = jax.linearize(of, inputs)
     change = jnp.max(jnp.abs(jax.vmap(change_by)(moved)), axis=0)
     # The derivative can be non-finite if `fn` is not differentiable in `args`.
