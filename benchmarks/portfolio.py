@@ -8,11 +8,12 @@ MuJoCo (Runge-Kutta in the coordinates of the joints) and diffrax (Tsit5 on our 
 they can do the same work (extra `peers`). Each program does each work in a process of its
 own, so that the first call and the memory are its own. All are on one core, and take turns:
 a ratio is the median of those of runs right after one another. All times are those of the
-processor. Errors are the largest of any position at the end, in metres, against a closed
-form, an explicit run in minimal coordinates at tight tolerance, or another program with
-finer steps. Gradients, with respect to the start, the masses and the step, are compared
-with difference quotients. `--quick` does a few works; `--only` keeps what is saved of
-others. Writes portfolio.json, .md and .png; the table is that of
+processor. The time of a step is that of a run without that of a run of one step, which is
+mostly the call. Errors are the largest of any position at the end, in metres, against a
+closed form, an explicit run in minimal coordinates at tight tolerance, or another program
+with finer steps. Gradients, with respect to the start, the masses and the step, are
+compared with difference quotients. `--quick` does a few works; `--only` keeps what is saved
+of others. Writes portfolio.json, .md and .png; the table is that of
 `docs/speed-and-accuracy.md`.
 """
 

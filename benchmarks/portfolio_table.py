@@ -8,8 +8,8 @@ from typing import Any
 Record = dict[str, Any]
 _HEAD = (
     "work", "scheme", "a step, us", "EXUDYN, us", "ratio", "others, us", "corrections",
-    "first call, s", "gradient / run", "its first call, s", "memory, MB", "error, m",
-    "EXUDYN's", "energy",
+    "a call, ms", "first call, s", "gradient / run", "its first call, s", "memory, MB",
+    "error, m", "EXUDYN's", "energy",
 )  # fmt: skip
 
 
@@ -46,6 +46,7 @@ def _cells(row: Record) -> Iterator[str]:
     others = (name for name in peers if name != "exudyn" and "us_per_step" in peers[name])
     yield ", ".join(f"{_NAMES[k]} {_number(peers[k]['us_per_step'])}" for k in others)
     yield _number(row.get("corrections"))
+    yield _number(row.get("call_ms"))
     is_first = "first_call_s" in row
     yield _with_bar(row["first_call_s"], bars["first_call"]) if is_first else ""
     yield _with_bar(gradient.get("ratio"), bars["gradient_ratio"]) if gradient else ""

@@ -35,6 +35,9 @@ SCHEMES: dict[str, Callable[[], ej.AbstractScheme]] = {
     "EnergyDecaying(0.5)": lambda: ej.EnergyDecaying(0.5),
     "Composed(EnergyPreserving, 4)": lambda: ej.Composed(ej.EnergyPreserving(), 4),
     "Composed(EnergyConsistent, 6)": lambda: ej.Composed(ej.EnergyConsistent(0.0), 6),
+    "Composed(Rattle, 4)": lambda: ej.Composed(ej.Rattle(), 4),
+    "Composed(Rattle, 6)": lambda: ej.Composed(ej.Rattle(), 6),
+    "Composed(Rattle, 8)": lambda: ej.Composed(ej.Rattle(), 8),
 }
 COLOURS = dict(ours="C0", dae="C3", ode="C2")
 

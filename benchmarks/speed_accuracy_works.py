@@ -91,25 +91,52 @@ def chain_rates(y: np.ndarray, masses: np.ndarray) -> np.ndarray:
     return np.concatenate([v.ravel(), (inverse[:, None] * pull + [0.0, G]).ravel()])
 
 
-def _steps(second: tuple[float, ...], fourth: tuple[float, ...]) -> Steps:
-    """Steps for schemes of orders 2 and 3, and for those of higher order."""
-    low = ("EnergyPreserving", "EnergyDecaying(0.5)")
-    high = ("EnergyConsistent(0)", "Composed(EnergyPreserving, 4)")
-    top = "Composed(EnergyConsistent, 6)"
-    return dict.fromkeys(low, second) | dict.fromkeys(high, fourth) | {top: fourth}
+def _steps(
+    second: tuple[float, ...], fourth: tuple[float, ...], high: tuple[float, ...]
+) -> Steps:
+    """Steps for schemes of orders 2 and 3, for those of order 4, and of higher order."""
+    kinds = {
+        second: ("EnergyPreserving", "EnergyDecaying(0.5)"),
+        fourth: (
+            "EnergyConsistent(0)",
+            "Composed(EnergyPreserving, 4)",
+            "Composed(EnergyConsistent, 6)",
+            "Composed(Rattle, 4)",
+        ),
+        high: ("Composed(Rattle, 6)", "Composed(Rattle, 8)"),
+    }
+    return {scheme: steps for steps, schemes in kinds.items() for scheme in schemes}
 
 
 WORKS = {
-    "pendulum": Work((1.0,), 1.0, 10.0, _steps((1e-2, 1e-3), (4e-2, 1e-2, 2.5e-3))),
+    "pendulum": Work(
+        (1.0,), 1.0, 10.0, _steps((1e-2, 1e-3), (4e-2, 2e-2, 1e-2, 2.5e-3), (5e-2, 2.5e-2))
+    ),
     "double pendulum": Work(
-        (1.0,) * 2, 1.0, 10.0, _steps((4e-3, 1e-3), (2e-2, 5e-3, 2e-3))
+        (1.0,) * 2,
+        1.0,
+        10.0,
+        _steps((4e-3, 1e-3), (4e-2, 2e-2, 8e-3, 5e-3, 2e-3), (5e-2, 2.5e-2, 1e-2)),
     ),
     "light inner mass": Work(
-        (0.005, 1.0), 1.0, 2.0, _steps((1e-3, 2.5e-4), (4e-3, 1e-3, 2.5e-4))
+        (0.005, 1.0),
+        1.0,
+        2.0,
+        _steps((1e-3, 2.5e-4), (8e-3, 4e-3, 2e-3, 1e-3, 2.5e-4), (1e-2, 5e-3, 2.5e-3)),
     ),
-    "heavy top": Work((), 0.0, 1.0, _steps((1e-3, 2.5e-4), (4e-3, 1e-3, 5e-4))),
+    "heavy top": Work(
+        (), 0.0, 1.0, _steps((1e-3, 2.5e-4), (4e-3, 2e-3, 1e-3, 5e-4), (5e-3, 2.5e-3))
+    ),
     "chain of 8": Work(
-        (1 / 8,) * 8, 1 / 8, 2.0, _steps((1e-3, 2.5e-4), (2e-3, 1e-3, 2.5e-4))
+        (1 / 8,) * 8,
+        1 / 8,
+        2.0,
+        _steps((1e-3, 2.5e-4), (4e-3, 2e-3, 1e-3, 2.5e-4), (5e-3, 2.5e-3)),
     ),
-    "chain of 64": Work((1 / 64,) * 64, 1 / 64, 1.0, _steps((1e-3,), (1e-3,))),
+    "chain of 64": Work(
+        (1 / 64,) * 64,
+        1 / 64,
+        1.0,
+        _steps((1e-3,), (2e-3, 1.25e-3, 1e-3, 5e-4), (2.5e-3, 1.25e-3)),
+    ),
 }
