@@ -46,23 +46,54 @@ class Bounds(NamedTuple):
     rounds: int
 
 
+class Bundle(NamedTuple):
+    """`n` sets of `r` rows of `B` each; the rows of a set have entries in the same blocks.
+
+    A row is stored as segments, one for each block of `W` in which it has entries. Indices
+    of absent entries are one past the end, except where what is read is multiplied by zero;
+    then they are any index.
+
+    - `rows`: the rows of each set, shape `(n, r)`.
+    - `touched`: the block of `W` of each segment, shape `(n, segments)`.
+    - `columns`: the unknowns of each segment, shape `(n, segments, size)`; `read`: the same
+      with any unknown for absent ones.
+    - `entries`: the index of each entry in the coloured products, shape
+      `(n, r, segments, size)`.
+    """
+
+    rows: np.ndarray
+    touched: np.ndarray
+    columns: np.ndarray
+    read: np.ndarray
+    entries: np.ndarray
+
+
+class Pairs(NamedTuple):
+    """`p` pairs of sets, in which `c` segments are in the same blocks.
+
+    - `bundles`: the two bundles of the sets.
+    - `segments`: the segments that are paired, by their number in each bundle, shape
+      `(2, p, c)`.
+    - `is_own`: whether each set is paired with itself. Then only entries of the lower
+      triangle are computed, else those of all rows of the one with all of the other.
+    """
+
+    bundles: tuple[int, int]
+    segments: np.ndarray
+    is_own: bool
+
+
 class SchurTables(Indices):
     """The index tables by which the entries of `B` and `G` are found.
 
-    They are constructed at trace time. A row of `B` is stored as segments, one for each
-    block of `W` in which it has entries. Indices of absent entries are one past the end,
-    except where what is read is multiplied by zero or not used; then they are any index.
+    They are constructed at trace time.
 
     - `colours`: the colours of the columns of `B`. Columns of equal colour share no row.
-    - `touched`: the block of `W` of each segment, shape `(rows, segments)`.
-    - `columns`: the unknowns of each segment, shape `(rows, segments, size)`; `read`: the
-      same with any unknown for absent ones.
-    - `entries`: the index of each entry of the segments in the coloured products.
-    - `transposed`: the indices of the entries of each column of `B` in the segments.
+    - `bundles`: the rows; `back`: the place of each row among those of all bundles.
+    - `transposed`: the places of each unknown in the segments of all bundles.
     - `elimination`: the nodes of `G`, its entries, and the order of their elimination.
-    - `shared`: the segments of the two rows of each entry in the blocks of `W` that they
-      have in common, shape `(2, entries, common)` for each number of these; `order`: the
-      places of the entries in all of them.
+    - `pairs`: the blocks of `G`; `order`: the place of each entry in these, or one past the
+      end for an entry that is zero before the elimination.
     - `diagonal`: the places of the diagonal entries.
     """
 
@@ -81,13 +112,12 @@ class SchurTables(Indices):
         content = rows, columns, blocks.ravel(), blocks.shape, colours, eliminated
         super().__init__(np.concatenate(content).astype(int))
         self.colours = colours
-        self.touched = segments.touched
         none = np.full((1, blocks.shape[1]), size)
-        self.columns = np.concatenate([blocks, none])[self.touched]
-        self.read = with_any(self.columns, size)
-        self._find_entries(rows, columns, size)
+        blocks = np.concatenate([blocks, none])
+        self._find_bundles(rows * (size + 1) + columns, segments.touched, blocks, size)
+        self._find_transposed(size)
         self.elimination = GraphElimination(order)
-        self._find_shared()
+        self._find_pairs()
 
     @property
     def description(self) -> str:
@@ -99,40 +129,106 @@ class SchurTables(Indices):
         """For each colour, the sum of the columns of `B`, the Jacobian of `fn`."""
         return coloured_products(fn, at, self.colours)
 
-    def _find_entries(self, rows: np.ndarray, columns: np.ndarray, size: int) -> None:
+    def _find_bundles(
+        self, numbers: np.ndarray, touched: np.ndarray, blocks: np.ndarray, size: int
+    ) -> None:
+        """Divides the rows by the blocks that they touch; `numbers` tell their entries."""
         num_colours = int(self.colours.max(initial=0)) + 1
-        row = np.arange(self.num_rows)[:, None, None]
-        number = lambda row, column: row * (size + 1) + column
-        known = np.isin(number(row, self.columns), number(rows, columns))
-        place = row * num_colours + np.append(self.colours, 0)[self.columns]
-        self.entries = np.where(known, place, self.num_rows * num_colours)
-        places, columns = np.flatnonzero(known), self.columns[known]
+        colours = np.append(self.colours, 0)
+        _, labels = np.unique(touched, axis=0, return_inverse=True)
+        labels = labels.ravel()
+        of_label = np.split(
+            np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels))
+        )
+        by_size: dict[int, list[np.ndarray]] = {}
+        for rows in of_label[:-1]:
+            by_size.setdefault(rows.size, []).append(rows)
+        self.bundles: list[Bundle] = []
+        for sets in by_size.values():
+            # In the order of the rows, which are often neighbours.
+            rows = np.array(sorted(sets, key=lambda x: int(x[0])))
+            columns = blocks[touched[rows[:, 0]]]
+            number = rows[:, :, None, None] * (size + 1) + columns[:, None]
+            place = rows[:, :, None, None] * num_colours + colours[columns][:, None]
+            entries = np.where(np.isin(number, numbers), place, self.num_rows * num_colours)
+            read = with_any(columns, size)
+            bundle = Bundle(rows, touched[rows[:, 0]], columns, read, entries)
+            self.bundles.append(bundle)
+        self.back = np.argsort(np.concatenate([x.rows.ravel() for x in self.bundles]))
+
+    def _find_transposed(self, size: int) -> None:
+        absent = self.num_rows * (int(self.colours.max(initial=0)) + 1)
+        columns = np.concatenate(
+            [
+                np.where(np.any(x.entries < absent, axis=1), x.columns, size).ravel()
+                for x in self.bundles
+            ]
+        )
+        places = np.flatnonzero(columns < size)
+        columns, count = columns[places], columns.size
         order = np.argsort(columns, kind="stable")
         counts = np.bincount(columns, minlength=size)
         within = np.arange(order.size) - np.repeat(np.cumsum(counts) - counts, counts)
-        self.transposed = np.full((size, counts.max(initial=1)), known.size)
+        self.transposed = np.full((size, counts.max(initial=1)), count)
         self.transposed[columns[order], within] = places[order]
 
-    def _find_shared(self) -> None:
-        """Which segments the rows of each entry of `G` have in common."""
-        rows, columns = self.elimination.entries.T
-        is_there = np.any(self.columns < self.transposed.shape[0], axis=-1)
-        common = self.touched[rows][:, :, None] == self.touched[columns][:, None]
-        entry, one, other = np.nonzero(common & is_there[rows][:, :, None])
-        counts = np.bincount(entry, minlength=rows.size)
-        num_segments = self.touched.shape[1]
-        numbers = np.stack(
-            [rows[entry] * num_segments + one, columns[entry] * num_segments + other]
+    def _find_pairs(self) -> None:
+        """Which segments two sets have in common, and where the entries are computed."""
+        place_of_row: dict[int, tuple[int, int, int]] = {
+            int(row): (number, k, r)
+            for number, bundle in enumerate(self.bundles)
+            for (k, r), row in np.ndenumerate(bundle.rows)
+        }
+        found: dict[tuple[int, int, int, bool], list[np.ndarray]] = {}
+        known: dict[tuple, tuple[tuple, int] | None] = {}
+        places: list[tuple[tuple, int, int, int] | None] = []
+        for one, other in self.elimination.entries.tolist():
+            a, b = sorted((place_of_row[one], place_of_row[other]), reverse=True)
+            sets = a[:2], b[:2]
+            if sets not in known:
+                known[sets] = self._pair(*sets, found)
+            pair = known[sets]
+            places.append(None if pair is None else (*pair, a[2], b[2]))
+        starts, total = {}, 0
+        self.pairs = []
+        for key, segments in found.items():
+            one, other, _, is_own = key
+            self.pairs.append(Pairs((one, other), np.stack(segments, axis=1), is_own))
+            starts[key] = total
+            total += len(segments) * self._entries_of_pair(key)
+        self.order = np.array(
+            [total if x is None else starts[x[0]] + self._place(*x) for x in places], int
         )
-        starts = np.cumsum(counts) - counts
-        self.shared, order = [], []
-        for count in np.unique(counts):
-            of = np.flatnonzero(counts == count)
-            self.shared.append(numbers[:, starts[of][:, None] + np.arange(count)])
-            order.append(of)
-        self.order = np.argsort(np.concatenate(order))
+        rows, columns = self.elimination.entries.T
         diagonal = np.flatnonzero(rows == columns)
         self.diagonal = diagonal[np.argsort(rows[diagonal])]
+
+    def _pair(
+        self, one: tuple[int, int], other: tuple[int, int], found: dict[tuple, list]
+    ) -> tuple[tuple, int] | None:
+        """Adds a pair of sets to those that are `found`, and returns its place there."""
+        (a, k), (b, j) = one, other
+        touched = self.bundles[a].touched[k], self.bundles[b].touched[j]
+        is_there = np.any(self.bundles[a].columns[k] < self.transposed.shape[0], axis=-1)
+        common = (touched[0][:, None] == touched[1][None]) & is_there[:, None]
+        segments = np.array(np.nonzero(common))
+        if segments.shape[1] == 0:
+            return None
+        key = a, b, segments.shape[1], one == other
+        numbers = segments + np.array([[k], [j]]) * common.shape[0]
+        found.setdefault(key, []).append(numbers)
+        return key, len(found[key]) - 1
+
+    def _entries_of_pair(self, key: tuple[int, int, int, bool]) -> int:
+        a, b, _, is_own = key
+        one, other = (self.bundles[x].rows.shape[1] for x in (a, b))
+        return one * (one + 1) // 2 if is_own else one * other
+
+    def _place(self, key: tuple[int, int, int, bool], number: int, r: int, q: int) -> int:
+        """The place of an entry among those of all pairs of one kind."""
+        _, b, _, is_own = key
+        within = r * (r + 1) // 2 + q if is_own else r * self.bundles[b].rows.shape[1] + q
+        return number * self._entries_of_pair(key) + within
 
 
 class _Segments:
@@ -227,21 +323,29 @@ def _order(
 class Schur(eqx.Module):
     """`B`, and the block factorisation of `G = B W B^T`.
 
-    - `rows`: the segments of the rows of `B`; see `SchurTables`.
+    - `rows`: the segments of the rows of each bundle; see `SchurTables`.
     - `factors`: see `GraphElimination`.
     """
 
     tables: SchurTables = eqx.field(static=True)
-    rows: Float[Array, "rows segments size"]
+    rows: list[Float[Array, "n r segments size"]]
     factors: Factors
 
     def product(self, u: Float[Array, " n"]) -> Float[Array, " rows"]:
         """`B u`"""
-        return jnp.sum(self.rows * at_places(u, self.tables.read), axis=(-2, -1))
+        found = [
+            jnp.sum(rows * at_places(u, bundle.read)[:, None], axis=(-2, -1)).ravel()
+            for rows, bundle in zip(self.rows, self.tables.bundles, strict=True)
+        ]
+        return at_places(jnp.concatenate(found), self.tables.back)
 
     def transposed(self, x: Float[Array, " rows"]) -> Float[Array, " n"]:
         """`B^T x`"""
-        entries = jnp.append((self.rows * x[:, None, None]).ravel(), 0)
+        found = [
+            jnp.sum(rows * at_places(x, bundle.rows)[:, :, None, None], axis=1).ravel()
+            for rows, bundle in zip(self.rows, self.tables.bundles, strict=True)
+        ]
+        entries = jnp.concatenate([*found, jnp.zeros((1,), x.dtype)])
         return jnp.sum(at_places(entries, self.tables.transposed), axis=-1)
 
     def solve(self, right: Float[Array, "k rows"]) -> Float[Array, "k rows"]:
@@ -311,22 +415,42 @@ def _factorised(tables: SchurTables, entries: Float[Array, " entries"]) -> Facto
 
 def _weighted(
     tables: SchurTables, products: Float[Array, "rows colours"], weight: Symmetric
-) -> tuple[Array, Array]:
-    """The segments of the rows of `B`, and of `B W`."""
-    rows = at_places(jnp.append(products.ravel(), 0), tables.entries)
-    if isinstance(weight, BlockDiagonal):
-        none = jnp.zeros((1, *weight.blocks.shape[1:]), rows.dtype)
-        blocks = at_places(jnp.concatenate([weight.blocks, none]), tables.touched)
-        blocks = weight.with_known_zeros(blocks)
-    else:
-        blocks = weight[None, None]
-    return rows, jnp.sum(blocks * rows[:, :, None, :], axis=-1)
+) -> tuple[list[Array], list[Array]]:
+    """The segments of the rows of each bundle, those of `B` and those of `B W`."""
+    numbers = jnp.append(products.ravel(), 0)
+    all_rows, all_weighted = [], []
+    for bundle in tables.bundles:
+        rows = at_places(numbers, bundle.entries)
+        if isinstance(weight, BlockDiagonal):
+            none = jnp.zeros((1, *weight.blocks.shape[1:]), rows.dtype)
+            blocks = at_places(jnp.concatenate([weight.blocks, none]), bundle.touched)
+            blocks = weight.with_known_zeros(blocks)
+        else:
+            blocks = weight[None, None]
+        all_rows.append(rows)
+        all_weighted.append(jnp.sum(blocks[:, None] * rows[:, :, :, None, :], axis=-1))
+    return all_rows, all_weighted
 
 
-def _entries(tables: SchurTables, rows: Array, weighted: Array) -> Float[Array, " entries"]:
-    left, right = (x.reshape(-1, rows.shape[-1]) for x in (weighted, rows))
-    found = [
-        jnp.sum(at_places(left, one) * at_places(right, other), axis=(1, 2))
-        for one, other in tables.shared
-    ]
-    return at_places(jnp.concatenate(found), tables.order)
+def _entries(
+    tables: SchurTables, rows: list[Array], weighted: list[Array]
+) -> Float[Array, " entries"]:
+    found = []
+    for pairs in tables.pairs:
+        one, other = pairs.bundles
+        left = at_places(_by_segments(weighted[one]), pairs.segments[0])
+        right = at_places(_by_segments(rows[other]), pairs.segments[1])
+        if pairs.is_own:
+            below, beside = np.tril_indices(left.shape[2])
+            product = left[:, :, below] * right[:, :, beside]
+        else:
+            product = left[:, :, :, None] * right[:, :, None]
+        found.append(jnp.sum(product, axis=(1, -1)).ravel())
+    zero = jnp.zeros((1,), rows[0].dtype)
+    return at_places(jnp.concatenate([*found, zero]), tables.order)
+
+
+def _by_segments(rows: Float[Array, "n r segments size"]) -> Float[Array, "m r size"]:
+    """The rows of each segment, where `m` is `n` times the number of segments."""
+    by_segment = jnp.moveaxis(rows, 2, 1)
+    return by_segment.reshape(-1, *by_segment.shape[2:])
