@@ -104,13 +104,20 @@ GRAPHS = {
 }
 
 
-@pytest.mark.parametrize("coupled", [False, True])
+@pytest.mark.parametrize(
+    ("coupled", "mixed"), [(False, False), (False, True), (True, True)]
+)
 @pytest.mark.parametrize("graph", GRAPHS)
-def test_the_matrix_of_the_multipliers_is_that_of_dense_algebra(graph, coupled):
+def test_the_matrix_of_the_multipliers_is_that_of_dense_algebra(graph, coupled, mixed):
+    """Of joints with two rows each, or with one, two or three in any order."""
     joints = np.array(GRAPHS[graph])
     count = joints.max() + 1
     rng = np.random.default_rng(0)
-    a, b = (jnp.asarray(rng.normal(size=(len(joints), 2, 3))) for _ in range(2))
+    if mixed:
+        joints = rng.permutation(np.repeat(joints, 1 + np.arange(len(joints)) % 3, axis=0))
+    per_joint = 1 if mixed else 2
+    shape = len(joints), per_joint, 3
+    a, b = (jnp.asarray(rng.normal(size=shape)) for _ in range(2))
 
     def rows(u):
         bodies = jnp.concatenate([u.reshape(count, 3), jnp.zeros((1, 3))])
@@ -125,7 +132,7 @@ def test_the_matrix_of_the_multipliers_is_that_of_dense_algebra(graph, coupled):
     symmetric = in_blocks(jnp.asarray(weight))
     tables = schur_tables(rows, at, symmetric)
     assert tables is not None
-    u, x = rng.normal(size=3 * count), rng.normal(size=(2, 2 * len(joints)))
+    u, x = rng.normal(size=3 * count), rng.normal(size=(2, per_joint * len(joints)))
 
     @jax.jit
     def found(at, u, x):

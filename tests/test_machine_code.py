@@ -747,6 +747,42 @@ def test_lanes_of_many_numbers_spread_over_the_cache(lanes):
     assert max(lines.count(line) for line in lines) <= 2
 
 
+def test_only_what_is_read_from_the_memory_is_written():
+    """Joined arrays have cells, but operations on all of them need none."""
+
+    def fn(x):
+        both = jnp.concatenate([jnp.sin(x), jnp.cos(x)])
+        return jnp.max(both * both), jnp.sum(jnp.abs(both))
+
+    program = jax.make_jaxpr(fn)(jnp.ones(64))
+    cellar, _, outputs = library.graph_of(program.jaxpr, [None])
+    emission.Emission(cellar, [places for _, places in outputs])
+    regions = list(scheduling.all_regions(cellar.graph.root))
+    numbers = [x for region in regions for x in region.nodes if x.lanes]
+    assert len(numbers) > 4
+    assert not [x for x in numbers if x.place is not None and not x.is_reduced]
+
+
+def test_numbers_of_lanes_begin_with_a_line_of_the_cache():
+    def fn(x):
+        step = lambda y, k: (jnp.sin(y) * k + jnp.arange(13.0), y[3])
+        return jax.lax.scan(step, x, jnp.arange(1.0, 80))
+
+    program = jax.make_jaxpr(fn)(jnp.ones(13))
+    known = [*map(np.asarray, program.consts), None]
+    cellar, inputs, outputs = library.graph_of(program.jaxpr, known)
+    of_code = emission.Emission(cellar, [places for _, places in outputs])
+    regions = list(scheduling.all_regions(cellar.graph.root))
+    own = [x.place for region in regions for x in region.nodes if x.lanes == 13]
+    places = [x for x in own if x is not None] + [first for _, first, _ in inputs]
+    places += [int(places[0]) for _, places in outputs]
+    assert len(places) > 3
+    assert all(of_code.address(place) % 8 == 0 for place in places)
+    sizes = list(map(len, cellar.constants))
+    assert 13 in sizes
+    assert sum(sizes[: sizes.index(13)]) % 8 == 0
+
+
 def test_code_ordered_quickly_gives_the_same_numbers(monkeypatch):
     fn = jax.vmap(lambda x: jnp.cumsum(jnp.sin(x)[::-1] / (2 + x * x)) @ jnp.exp(-x))
     other = lambda x: (fn(x), jnp.cos(x))
