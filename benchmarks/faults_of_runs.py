@@ -152,6 +152,14 @@ FAULTS = (
         of("explain::test_a_long_chain_in_directors_is_eliminated_in_few_rounds"),
     ),
     Fault(
+        "diffrax: zeros of the start",
+        "_tools/diffrax.py",
+        "    model = _model(system, start, args)\n",
+        "    model = make_model(system, start, args)\n",
+        "Coordinates that are zero at the start are missing in the constraints.",
+        of("measure::test_accelerations_away_from_a_start_with_zeros"),
+    ),
+    Fault(
         "memory: all results are written",
         "_programs/machine_code/scheduling.py",
         "                node.place = None\n",

@@ -2,6 +2,7 @@
 
 import functools
 import sys
+import types
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ import pytest
 import enerjax as ej
 from enerjax._tools.measure.reference import extrapolated, Task
 
-from .helpers import problem
+from .helpers import EPS, problem
 from .references import double_pendulum_reference, HEAVY_TOP, point_on_rod
 
 
@@ -172,6 +173,33 @@ def test_diffrax_on_a_body_that_rotates():
     state, exact = term.vector_field.state(0.1, y), HEAVY_TOP[0.1]
     np.testing.assert_allclose(state.q[:3], exact.position, rtol=0, atol=1e-8)
     np.testing.assert_allclose(state.v[3:], exact.spin, rtol=0, atol=1e-6)
+
+
+def test_accelerations_away_from_a_start_with_zeros(monkeypatch):
+    """A chain that starts horizontally moves vertically too."""
+    term = lambda field: types.SimpleNamespace(vector_field=field)
+    monkeypatch.setitem(sys.modules, "diffrax", types.SimpleNamespace(ODETerm=term))
+    system, start, args = ej.problems.chain(8)
+    found, _ = ej.to_diffrax(system, start, args)
+    angles, spins = np.random.default_rng(0).normal(size=(2, 8))
+    direction = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    lengths = np.asarray(args["l"])[:, None]
+    q = jnp.asarray(np.cumsum(lengths * direction, axis=0).ravel())
+    normal = np.stack([-np.sin(angles), np.cos(angles)], axis=1) * spins[:, None]
+    v = jnp.asarray(np.cumsum(lengths * normal, axis=0).ravel())
+    _, acceleration = found.vector_field(0.0, (q, v))
+    # The same by dense algebra.
+    rods = lambda q: system.constraint(q, args)
+    gradients = np.asarray(jax.jacfwd(rods)(q))
+    bending = jax.jvp(lambda q: jax.jvp(rods, (q,), (v,))[1], (q,), (v,))[1]
+    force = -np.asarray(jax.grad(lambda q: system.potential(q, args))(q))
+    weight = np.diag(1 / np.repeat(args["m"], 2))
+    matrix = gradients @ weight @ gradients.T
+    right = gradients @ weight @ force + np.asarray(bending)
+    expected = weight @ (force - gradients.T @ np.linalg.solve(matrix, right))
+    # Round-off, by the condition of the matrix.
+    atol = 100 * EPS * np.linalg.cond(matrix) * np.max(np.abs(expected))
+    np.testing.assert_allclose(acceleration, expected, rtol=0, atol=atol)
 
 
 def test_without_diffrax_the_extra_is_named(monkeypatch):

@@ -29,6 +29,9 @@ def make_model(
 ) -> AbstractModel:
     """The model of a system. The scales are those at `state`, which is a user's state.
 
+    It must be made in a program that JAX traces: numbers that are known and zero would
+    count as zero in every state, and be missing in the patterns of Jacobians.
+
     Rigid bodies in the dimensions `rotates_in` are moved by rotations; if it is `elastic`,
     the chord method includes the stiffness of strains. See `SeparableModel`.
     """

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._operators import AbstractModel, make_model
+from .._programs import compiled
 from .._system import AbstractSystem, check_system, State
 from .._types import Args, Coordinates, Multipliers, Real, Velocities
 
@@ -76,6 +77,16 @@ def to_diffrax(
             'python -m pip install "enerjax[diffrax]"'
         ) from error
     start, args = check_system(system, start, args, t0)
-    model = make_model(system, start, args)
+    model = _model(system, start, args)
     begin = model.to_internal(start)
     return diffrax.ODETerm(IndexReduced(model)), (begin.q, begin.v)
+
+
+@compiled
+def _model(system: AbstractSystem, start: State, args: Args) -> AbstractModel:
+    """The model, made in a program, where the numbers of the start are not known.
+
+    Otherwise what is zero at the start would count as zero everywhere: the pattern of the
+    constraints of a chain that starts horizontally would lack all vertical coordinates.
+    """
+    return make_model(system, start, args)
