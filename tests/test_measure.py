@@ -180,6 +180,9 @@ def test_accelerations_away_from_a_start_with_zeros(monkeypatch):
     term = lambda field: types.SimpleNamespace(vector_field=field)
     monkeypatch.setitem(sys.modules, "diffrax", types.SimpleNamespace(ODETerm=term))
     system, start, args = ej.problems.chain(8)
+    assert isinstance(system, ej.System)
+    constraint, potential = system.constraint, system.potential
+    assert constraint is not None
     found, _ = ej.to_diffrax(system, start, args)
     angles, spins = np.random.default_rng(0).normal(size=(2, 8))
     direction = np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -189,10 +192,10 @@ def test_accelerations_away_from_a_start_with_zeros(monkeypatch):
     v = jnp.asarray(np.cumsum(lengths * normal, axis=0).ravel())
     _, acceleration = found.vector_field(0.0, (q, v))
     # The same by dense algebra.
-    rods = lambda q: system.constraint(q, args)
+    rods = lambda q: constraint(q, args)
     gradients = np.asarray(jax.jacfwd(rods)(q))
     bending = jax.jvp(lambda q: jax.jvp(rods, (q,), (v,))[1], (q,), (v,))[1]
-    force = -np.asarray(jax.grad(lambda q: system.potential(q, args))(q))
+    force = -np.asarray(jax.grad(lambda q: potential(q, args))(q))
     weight = np.diag(1 / np.repeat(args["m"], 2))
     matrix = gradients @ weight @ gradients.T
     right = gradients @ weight @ force + np.asarray(bending)
