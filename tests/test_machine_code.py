@@ -783,6 +783,31 @@ def test_numbers_of_lanes_begin_with_a_line_of_the_cache():
     assert sum(sizes[: sizes.index(13)]) % 8 == 0
 
 
+@pytest.mark.parametrize("count", [9, 64])
+def test_slices_across_the_parts_of_a_carry(count):
+    """An inner loop takes over a carry of two columns, and changes entries of both."""
+
+    def fn(x):
+        last = 12 + jnp.int32(3 * jnp.abs(x[0])) % 3
+
+        def outer(y, add):
+            def change(s):
+                k, y = s
+                return k + 1, jax.lax.dynamic_update_slice(y, (y[k] + add)[None], (k,))
+
+            _, y = jax.lax.while_loop(lambda s: s[0] < last, change, (0, y))
+            return y, y[0]
+
+        both = jnp.concatenate([jnp.sin(x), jnp.cos(x)])
+        return jax.lax.scan(outer, both, jnp.arange(80.0))
+
+    x = jnp.linspace(0.1, 1, count)
+    assert is_compiled(in_one_function(fn), x)
+    found, expected = jax.jit(in_one_function(fn))(x), jax.jit(fn)(x)
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+
+
 def test_code_ordered_quickly_gives_the_same_numbers(monkeypatch):
     fn = jax.vmap(lambda x: jnp.cumsum(jnp.sin(x)[::-1] / (2 + x * x)) @ jnp.exp(-x))
     other = lambda x: (fn(x), jnp.cos(x))

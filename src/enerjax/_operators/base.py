@@ -607,13 +607,14 @@ def _term_size(
         return fn(other, State(q, state.v, state.t))
 
     inputs = jax.lax.stop_gradient(inputs)
+    flat, unravel = ravel_pytree(inputs)
     # Random fractions, because those of a regular sequence cancel in second differences,
     # such as the forces between the nodes of a beam, and several, because those of one
     # draw nearly cancel in some rows of many.
-    flat, unravel = ravel_pytree(inputs)
     parts = np.random.default_rng(0).uniform(0.5, 1.5, (_DRAWS, flat.size))
     parts = jax.vmap(unravel)(jnp.asarray(parts, flat.dtype))
-    # One array after the other: those of `args` are the same in all steps.
+    # One array after the other, so that products with `args`, which are the same in all
+    # steps, are computed before the loop over the steps.
     moved = jax.tree.map(lambda part, x: part * x[None], parts, inputs)
     value, change_by = jax.linearize(of, inputs)
     change = jnp.max(jnp.abs(jax.vmap(change_by)(moved)), axis=0)

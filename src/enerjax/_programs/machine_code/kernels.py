@@ -193,6 +193,7 @@ class Kernel(Instructions):
             return self._lane_numbers()
         if x.lanes and not x.is_reduced:
             assert x.lanes == self.lanes
+            assert x.op == "load" or x.place is not None
             extra: Any = x.extra if x.op == "load" else (x.place, 1, None)
             return self._lanes_at(x.dtype, *extra)
         place = x.extra if x.op == "load" else x.place

@@ -265,14 +265,13 @@ def _block(
             parts = list(columns_along(np.arange(size).reshape(shape), lane))
     if copies > 1:
         sizes = {part.size for part in parts}
-        owner = Block(region, 0, sizes.pop() if len(sizes) == 1 else 1)
-        first = self.cellar.new(copies * size, owner)
-        places[np.concatenate(parts)] = first + np.arange(size)
-        return [owner], places.reshape(shape)
-    owners = []
-    for part in parts:
-        owners.append(Block(region, 0, part.size))
-        places[part] = self.cellar.new(part.size, owners[-1]) + np.arange(part.size)
+        owners = [Block(region, 0, sizes.pop() if len(sizes) == 1 else 1)]
+        first = self.cellar.new(copies * size, owners[0])
+    else:
+        owners = [Block(region, 0, part.size) for part in parts]
+        # Without gaps, because loops may change slices across several parts.
+        first = self.cellar.neighbours([part.size for part in parts], owners)
+    places[np.concatenate(parts)] = first + np.arange(size)
     return owners, places.reshape(shape)
 
 

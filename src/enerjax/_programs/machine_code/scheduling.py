@@ -67,10 +67,11 @@ def kernels_of(
 def _live(
     cellar: Cellar, regions: list[Region], outputs: Sequence[np.ndarray]
 ) -> set[Node]:
-    """The operations whose results are needed.
+    """Takes the cells of results that nothing reads from the memory, and returns the
+    operations whose results are needed.
 
-    Results that no operation reads from the memory lose their cells there: arrays are given
-    cells as soon as they are joined to others, for example.
+    Arrays get cells as soon as they are joined to others, for example, whether anything
+    reads them there or not.
     """
     live: set[Node] = set()
     read: set[Node | Block] = set(cellar.read_at_computed_places)

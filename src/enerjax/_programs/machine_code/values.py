@@ -10,6 +10,7 @@ An array whose numbers are known is a NumPy array. Any other is one of two kinds
 """
 
 import bisect
+from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -126,8 +127,9 @@ _LONG = 64
 def _next_line(place: int) -> int:
     """The next cell with which a line begins, from a cell on.
 
-    Numbers of lanes begin there, because several of them are read at once, and two lines
-    for one read take twice as long.
+    Numbers of lanes begin there. Several of them are read at once, and a read of two lines
+    takes longer: with lanes that begin anywhere a step of 64 points takes 1.2 times as
+    long.
     """
     return -(-place // _LINE) * _LINE
 
@@ -173,18 +175,27 @@ class Cellar:
 
     def new(self, count: int, owner: Node | Block) -> int:
         """The first of so many new cells."""
-        if count >= _FEWEST_LANES:
+        first = self.neighbours([count], [owner])
+        if count >= _LONG:
+            self.size = first + _distance(count)
+        return first
+
+    def neighbours(self, counts: Sequence[int], owners: Sequence[Node | Block]) -> int:
+        """The first of new cells for several owners, one after the other without gaps."""
+        if sum(counts) >= _FEWEST_LANES:
             self.size = _next_line(self.size)
-        last = len(self._owners)
-        self._starts.append(self.size)
-        self._owners.append(owner)
-        if last == self._owner_table.shape[1]:
-            table = self._owner_table
-            self._owner_table = np.concatenate([table, np.zeros_like(table)], axis=1)
-        is_reduced = isinstance(owner, Node) and owner.is_reduced
-        self._owner_table[:, last] = self.size, 1 if is_reduced else owner.lanes or 1
-        self.size += count if count < _LONG else _distance(count)
-        return self._starts[-1]
+        first = self.size
+        for count, owner in zip(counts, owners, strict=True):
+            last = len(self._owners)
+            self._starts.append(self.size)
+            self._owners.append(owner)
+            if last == self._owner_table.shape[1]:
+                table = self._owner_table
+                self._owner_table = np.concatenate([table, np.zeros_like(table)], axis=1)
+            is_reduced = isinstance(owner, Node) and owner.is_reduced
+            self._owner_table[:, last] = self.size, 1 if is_reduced else owner.lanes or 1
+            self.size += count
+        return first
 
     def hand_over(self, owners: list["Block"], region: Region, ready: int) -> None:
         """Makes cells readable in another region, from a level on."""

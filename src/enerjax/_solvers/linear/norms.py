@@ -5,7 +5,8 @@ from jaxtyping import Array, Float
 from ..._types import Scalar
 
 
-# Of arrays with more entries, so many pieces are compared entry by entry first.
+# Arrays with more entries are cut into so many pieces first, which are compared entry by
+# entry.
 _LARGE, _PIECES = 2048, 16
 
 

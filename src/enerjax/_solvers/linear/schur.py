@@ -50,13 +50,12 @@ class Bundle(NamedTuple):
     """`n` sets of `r` rows of `B` each; the rows of a set have entries in the same blocks.
 
     A row is stored as segments, one for each block of `W` in which it has entries. Indices
-    of absent entries are one past the end, except where what is read is multiplied by zero;
-    then they are any index.
+    of absent entries are one past the end.
 
     - `rows`: the rows of each set, shape `(n, r)`.
     - `touched`: the block of `W` of each segment, shape `(n, segments)`.
     - `columns`: the unknowns of each segment, shape `(n, segments, size)`; `read`: the same
-      with any unknown for absent ones.
+      with some unknown in place of absent ones, whose entries are zero.
     - `entries`: the index of each entry in the coloured products, shape
       `(n, r, segments, size)`.
     """
@@ -69,7 +68,7 @@ class Bundle(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """`p` pairs of sets, in which `c` segments are in the same blocks.
+    """`p` pairs of sets, each with `c` segments in blocks that both sets touch.
 
     - `bundles`: the two bundles of the sets.
     - `segments`: the segments that are paired, by their number in each bundle, shape
@@ -132,7 +131,10 @@ class SchurTables(Indices):
     def _find_bundles(
         self, numbers: np.ndarray, touched: np.ndarray, blocks: np.ndarray, size: int
     ) -> None:
-        """Divides the rows by the blocks that they touch; `numbers` tell their entries."""
+        """Divides the rows by the blocks that they touch.
+
+        `numbers` are `row * (size + 1) + column` for each entry of `B`.
+        """
         num_colours = int(self.colours.max(initial=0)) + 1
         colours = np.append(self.colours, 0)
         _, labels = np.unique(touched, axis=0, return_inverse=True)
@@ -234,7 +236,8 @@ class SchurTables(Indices):
 class _Segments:
     """The segments of the rows of `B`, and the orders in which they can be eliminated.
 
-    - `blocks`: the unknowns of each block of `W`; `touched`: see `SchurTables`.
+    - `blocks`: the unknowns of each block of `W`; `touched`: the blocks in which each row
+      has entries, shape `(rows, segments)`.
     """
 
     def __init__(self, pattern: "scipy.sparse.csr_array", weight: Symmetric):
