@@ -85,10 +85,10 @@ def _first_run(run: Callable[[], Any]) -> Record:
     return spent | dict(trace_s=rest, execute_s=again, first_call_s=first)
 
 
-def _seconds(run: Callable[[], Any], least: float = _LEAST_SECONDS) -> float:
-    """The mean time of a run, from runs that take at least this long in all."""
+def _seconds(run: Callable[[], Any]) -> float:
+    """The mean time of a run."""
     begin, count = harness.clock(), 0
-    while count == 0 or harness.clock() - begin < least:
+    while count == 0 or harness.clock() - begin < _LEAST_SECONDS:
         jax.block_until_ready(run())
         count += 1
     return (harness.clock() - begin) / count
@@ -99,7 +99,7 @@ def _timer(
 ) -> Callable[[], float]:
     """A measurement of the microseconds of a step of `run`.
 
-    `call()` is the time of a call without steps, in seconds.
+    `call()` are the seconds of `run` that do not belong to these `steps`.
     """
     return lambda: 1e6 * (_seconds(run) - call()) / steps
 

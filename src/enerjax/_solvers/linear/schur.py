@@ -422,17 +422,21 @@ def _weighted(
     """The segments of the rows of each bundle, those of `B` and those of `B W`."""
     numbers = jnp.append(products.ravel(), 0)
     all_rows, all_weighted = [], []
+    blocks_of = _blocks_of(weight)
     for bundle in tables.bundles:
-        rows = at_places(numbers, bundle.entries)
-        if isinstance(weight, BlockDiagonal):
-            none = jnp.zeros((1, *weight.blocks.shape[1:]), rows.dtype)
-            blocks = at_places(jnp.concatenate([weight.blocks, none]), bundle.touched)
-            blocks = weight.with_known_zeros(blocks)
-        else:
-            blocks = weight[None, None]
+        rows, blocks = at_places(numbers, bundle.entries), blocks_of(bundle)
         all_rows.append(rows)
         all_weighted.append(jnp.sum(blocks[:, None] * rows[:, :, :, None, :], axis=-1))
     return all_rows, all_weighted
+
+
+def _blocks_of(weight: Symmetric) -> Callable[[Bundle], Float[Array, "n segments b b"]]:
+    """The blocks of `W` that the segments of a bundle are in."""
+    if not isinstance(weight, BlockDiagonal):
+        return lambda bundle: weight[None, None]
+    none = jnp.zeros((1, *weight.blocks.shape[1:]), weight.blocks.dtype)
+    blocks = jnp.concatenate([weight.blocks, none])
+    return lambda bundle: weight.with_known_zeros(at_places(blocks, bundle.touched))
 
 
 def _entries(
