@@ -184,6 +184,22 @@ FAULTS = (
         of("machine_code::test_numbers_of_lanes_begin_with_a_line_of_the_cache"),
     ),
     Fault(
+        "lanes: ends that are neighbours",
+        "_programs/machine_code/values.py",
+        "self.owners(places[places == whole])",
+        "self.owners(inner)",
+        "A number that follows others in the memory is read before it is computed.",
+        of("machine_code::test_neighbouring_cells_with_others_at_the_ends"),
+    ),
+    Fault(
+        "lanes: along sums",
+        "_programs/machine_code/values.py",
+        " and value.lane not in summed:",
+        ":",
+        "Sums over lanes, which make a step of few bodies a tenth longer.",
+        of("machine_code::test_lanes_are_not_along_an_axis_that_is_summed"),
+    ),
+    Fault(
         "rows: order of bundles",
         "_solvers/linear/schur.py",
         "at_places(jnp.concatenate(found), self.tables.back)",

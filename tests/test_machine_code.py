@@ -698,8 +698,22 @@ def neighbours_in_branches(x):
     return jax.lax.fori_loop(0, 7, turn, row)
 
 
+def neighbours_of_which_the_last_is_computed_later(x):
+    """The first of eight numbers follows eight others from which it is computed."""
+    first = jnp.sin(jnp.resize(x.ravel(), (8,)) + jnp.linspace(0, 0.1, 8))
+    both = jnp.concatenate([first, jnp.cos(first) * jnp.sum(first**2)])
+    columns = np.array([[k, 5, 6, 7, 8] for k in range(5)])
+    return both[columns.T] ** 2
+
+
 @pytest.mark.parametrize(
-    "fn", [constants_between_ends, neighbours_in_branches], ids=lambda fn: fn.__name__
+    "fn",
+    [
+        constants_between_ends,
+        neighbours_in_branches,
+        neighbours_of_which_the_last_is_computed_later,
+    ],
+    ids=lambda fn: fn.__name__,
 )
 def test_neighbouring_cells_with_others_at_the_ends(fn):
     assert is_compiled(in_one_function(fn), X)
@@ -761,6 +775,22 @@ def test_only_what_is_read_from_the_memory_is_written():
     numbers = [x for region in regions for x in region.nodes if x.lanes]
     assert len(numbers) > 4
     assert not [x for x in numbers if x.place is not None and not x.is_reduced]
+
+
+def test_lanes_are_not_along_an_axis_that_is_summed():
+    """A sum over lanes costs more than sums of two numbers for each lane."""
+
+    def fn(blocks, x):
+        # As vectors of few bodies: the lanes of `y` are along the axis that is summed.
+        y = jnp.sin(x)
+        return jnp.sum(blocks * y[:, None, :], axis=-1), jnp.einsum("kij,kj->ki", blocks, y)
+
+    program = jax.make_jaxpr(fn)(jnp.ones((5, 6, 6)), jnp.ones((5, 6)))
+    cellar, _, _ = library.graph_of(program.jaxpr, [None, None])
+    regions = list(scheduling.all_regions(cellar.graph.root))
+    nodes = [x for region in regions for x in region.found.values()]
+    assert [x for x in nodes if x.lanes and x.op == "mul"]
+    assert not [x for x in nodes if x.is_reduced]
 
 
 def test_numbers_of_lanes_begin_with_a_line_of_the_cache():

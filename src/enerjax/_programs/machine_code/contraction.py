@@ -63,8 +63,6 @@ def contraction(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value
     kept = nb + nl + nr
     left = spread(left, [*at[: nb + nl], *at[kept:]])
     right = spread(right, [*at[:nb], *at[nb + nl : kept], *at[kept:]])
-    if max(shape[:kept], default=0) >= max(shape[kept:], default=1):
-        left, right = (_without_lanes(self, x, kept) for x in (left, right))
     of = [dtype_of(left), dtype_of(right)]
     rule = lambda a, b: self.graph.op(
         "mul",
@@ -74,20 +72,10 @@ def contraction(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value
             self.graph.op("convert", dtype, (b,), of[1]),
         ),
     )
-    product = self.map(rule, [left, right], tuple(shape), dtype)
+    product = self.map(rule, [left, right], tuple(shape), dtype, at[kept:])
     if nc == 0:
         return [product]
     return [self.total("add", product, tuple(at[kept:]))]
-
-
-def _without_lanes(self: "Evaluation", x: Value, first: int) -> Value:
-    """An array whose lanes are not along the axes from the first one on.
-
-    Those axes are summed over, and a sum over lanes costs more than the sum of two numbers
-    for each lane.
-    """
-    has_lanes = isinstance(x, Cells) and x.lane is not None and x.lane >= first
-    return self.cellar.memory(x) if has_lanes else x
 
 
 def _large_product(self: "Evaluation", eqn: Any, values: list[Value]) -> Value:

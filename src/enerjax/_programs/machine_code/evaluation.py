@@ -56,6 +56,8 @@ class Evaluation:
         self.cellar = Cellar(self.graph)
         # The rows in which vectors of some lengths are read.
         self.rows_of = rows_of or {}
+        # The axes along which an array is summed that is not used otherwise.
+        self._sums: dict[Any, Sequence[int]] = {}
 
     def outputs(
         self, jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]
@@ -69,6 +71,12 @@ class Evaluation:
             for x in atoms
             if not isinstance(x, Literal)
         )
+
+        self._sums |= {
+            eqn.invars[0]: eqn.params["axes"]
+            for eqn in jaxpr.eqns
+            if eqn.primitive.name == "reduce_sum" and uses[eqn.invars[0]] == 1
+        }
 
         def read(atom: Any) -> Value:
             if isinstance(atom, Literal):
@@ -151,7 +159,8 @@ class Evaluation:
         rule = functools.partial(
             ELEMENTWISE[eqn.primitive.name], self.graph, eqn.params, dtype, of
         )
-        return self.map(rule, values, shape, dtype)
+        summed = self._sums.get(eqn.outvars[0], ())
+        return self.map(rule, values, shape, dtype, summed)
 
     def map(
         self,
@@ -159,8 +168,12 @@ class Evaluation:
         values: list[Value],
         shape: tuple[int, ...],
         dtype: str,
+        summed: Sequence[int] = (),
     ) -> Value:
-        """An operation on numbers, for each entry of arrays of one shape, or of none."""
+        """An operation on numbers, for each entry of arrays of one shape, or of none.
+
+        `summed` are the axes along which the result will be summed.
+        """
         size = math.prod(shape)
         if size == 0:
             return np.zeros(shape, dtype)
@@ -169,7 +182,7 @@ class Evaluation:
         if rows is not None:
             values = [self.reshaped(x, rows) if x.shape else x for x in values]
             return self.reshaped(self.map(rule, values, rows, dtype), shape)
-        lane = lane_of(values, shape)
+        lane = lane_of(values, shape, summed)
         if lane is not None and size // shape[lane] > MOST_CELLS:
             return self._as_one_axis(rule, values, shape, dtype)
         if lane is None and size > MOST_CELLS:

@@ -370,8 +370,8 @@ class Cellar:
             return None
         inner = places[1:-1]
         whole = np.arange(inner[0] - 1, inner[-1] + 2)
-        # The cell before the first one belongs to another number, which is not used.
-        region, level, markers = self._readable(self.owners(inner))
+        # The cells of ends that are elsewhere belong to other numbers, which are not used.
+        region, level, markers = self._readable(self.owners(places[places == whole]))
         extra = (int(whole[0]), 1, None)
         x: Number = self.graph.at(region, level, "load", dtype, markers, extra, places.size)
         lane = self.graph.at(self.graph.root, 0, "lane", "i8", lanes=places.size)
@@ -585,23 +585,33 @@ def strides_of(places: np.ndarray) -> list[int] | None:
     return strides
 
 
-def lane_of(values: list[Value], shape: tuple[int, ...]) -> int | None:
-    """The axis of the lanes of an array that is computed from others of its shape."""
-    longest = max(shape, default=0)
+def lane_of(
+    values: list[Value], shape: tuple[int, ...], summed: Sequence[int] = ()
+) -> int | None:
+    """The axis of the lanes of an array that is computed from others of its shape.
+
+    If possible this is none of the axes along which the array is `summed`: a sum over lanes
+    costs more than the sum of two numbers for each lane.
+    """
+    own = [n for k, n in enumerate(shape) if k not in summed]
+    longest = max(own, default=0)
+    if longest < max((shape[k] for k in summed), default=0):
+        summed, longest = (), max(shape, default=0)
     for value in values:
         if isinstance(value, Cells) and value.lane is not None and value.shape == shape:
             # The few lanes of an operand that is the same along a long axis would be many
             # operations.
-            if 2 * value.n > longest:
+            if 2 * value.n > longest and value.lane not in summed:
                 return value.lane
-    return usual_lane(shape)
+    return usual_lane(shape, summed)
 
 
-def usual_lane(shape: tuple[int, ...]) -> int | None:
-    size, longest = int(np.prod(shape)), max(shape, default=0)
+def usual_lane(shape: tuple[int, ...], summed: Sequence[int] = ()) -> int | None:
+    lengths = [0 if k in summed else n for k, n in enumerate(shape)]
+    size, longest = int(np.prod(shape)), max(lengths, default=0)
     if longest < _FEWEST_LANES or (size <= _SMALL and longest < _MANY):
         return None
-    return shape.index(longest)
+    return lengths.index(longest)
 
 
 def columns_along(x: np.ndarray, axis: int) -> np.ndarray:
