@@ -1,6 +1,7 @@
 """Consistent starts: positions, velocities, accelerations and multipliers."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -130,10 +131,17 @@ def _nearest(
 ) -> State:
     checked_state, checked_args = check_system(system, state, args, t)
     if is_known((system, checked_state, checked_args)):
-        # This small program often saves the compilation of the large one.
-        is_consistent = _is_consistent(system, checked_state, checked_args)
-        if is_known(is_consistent) and is_consistent:
-            return State(checked_state.q, checked_state.v)
+        # These small programs often save the compilation of the large one.
+        facts = _facts(system, checked_state, checked_args)
+        if is_known(facts):
+            q = checked_state.q
+            if facts.has_position and facts.has_velocity:
+                return State(q, checked_state.v)
+            if facts.has_position:
+                _, known_v = _known_entries(system, checked_state, known)
+                v, kept = _moved_velocity(system, checked_state, checked_args, known_v)
+                if kept or not keep_known:
+                    return State(q, v)
     return _start(system, state, args, t, known, keep_known=keep_known, throw=throw).state
 
 
@@ -148,9 +156,7 @@ def _start(
     throw: bool,
 ) -> ConsistentStart:
     state, args = check_system(system, state, args, t)
-    known = _indices("known_q", known[0], state.q), _indices("known_v", known[1], state.v)
-    if known[1] and not isinstance(system, System):
-        raise ValueError("`known_v`: only a plain `System` can have known velocities.")
+    known = _known_entries(system, state, known)
     start, near, kept, rank = _project(system, state, args, known)
     if not throw:
         independent = system.redundant | (rank == start.multipliers.size)
@@ -178,22 +184,39 @@ def _start(
     )
 
 
+class _Facts(NamedTuple):
+    """Whether a start satisfies the constraints, and whether it satisfies their rates, to
+    round-off. Neither is said of one whose constraints are not independent."""
+
+    has_position: Flag
+    has_velocity: Flag
+
+
 @compiled_for_once
-def _is_consistent(system: AbstractSystem, state: State, args: Args) -> Flag:
-    """Whether each constraint and its rate vanish to round-off."""
+def _facts(system: AbstractSystem, state: State, args: Args) -> _Facts:
     model = make_model(system, state, args)
     inner = model.to_internal(state)
     q, t, scales = inner.q, inner.t, model.scales
     eps = jnp.finfo(q.dtype).eps
     terms = model.holonomic(scales.constraint_size)
-    position = jnp.abs(model.constraint(q, t)) <= 2 * eps * terms
+    position = jnp.all(jnp.abs(model.constraint(q, t)) <= 2 * eps * terms)
     rate = model.joint_rate(q, inner.v, t)
     speed = jnp.sqrt(2 * model.kinetic(inner))
-    slow = jnp.abs(rate) <= 2 * eps * speed * scales.constraint[: rate.size]
-    met = jnp.all(position) & jnp.all(slow)
-    if system.redundant:
-        return met
-    return met & (rank_of_constraints(model, inner) == scales.constraint.size)
+    slow = jnp.all(jnp.abs(rate) <= 2 * eps * speed * scales.constraint[: rate.size])
+    if not system.redundant:
+        count = scales.constraint.size
+        position = position & (rank_of_constraints(model, inner) == count)
+    return _Facts(position, position & slow)
+
+
+@compiled_for_once
+def _moved_velocity(
+    system: AbstractSystem, state: State, args: Args, known: tuple[int, ...]
+) -> tuple[Velocities, Flag]:
+    """The velocity at a consistent position, and whether it keeps known entries."""
+    model = make_model(system, state, args)
+    velocity, kept = project_velocity(model, model.to_internal(state), known)
+    return model.to_user(State(state.q, velocity, state.t)).v, kept
 
 
 def _raise_unless(
@@ -205,6 +228,17 @@ def _raise_unless(
     if not good:
         raise ValueError(f"{message} {figures()}")
     return start
+
+
+def _known_entries(
+    system: AbstractSystem, state: State, known: tuple[EntryIndices, EntryIndices]
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """The checked indices `known_q` and `known_v`."""
+    known_q, known_v = known
+    both = _indices("known_q", known_q, state.q), _indices("known_v", known_v, state.v)
+    if both[1] and not isinstance(system, System):
+        raise ValueError("`known_v`: only a plain `System` can have known velocities.")
+    return both
 
 
 def _indices(name: str, indices: EntryIndices, x: Array) -> tuple[int, ...]:

@@ -162,11 +162,15 @@ def project_velocity(
         return v, jnp.array(True)
     eps = jnp.finfo(v.dtype).eps
     unit = model.scales.constraint[:num_rates]
+    at = lambda v: model.inverse_regular_metric(State(q, v))
+    # Otherwise the metric depends on the momenta.
+    is_quadratic = not isinstance(model.system, HamiltonianSystem)
+    first_metric = at(v)
 
     def correct(
         v: Velocities, conditions: Conditions, unit: Array, regularisation: Array | None
     ) -> Velocities:
-        inverse_metric = model.inverse_regular_metric(State(q, v))
+        inverse_metric = first_metric if is_quadratic else at(v)
         rate = conditions(v)
 
         def change(mu: Array) -> Velocities:
@@ -176,7 +180,7 @@ def project_velocity(
         remaining = lambda mu: (rate - jax.jvp(conditions, (v,), (change(mu),))[1]) / unit
         return v - change(affine_root(remaining, rate, regularisation))
 
-    end, root = v, jnp.sqrt(model.inverse_regular_metric(state).diagonal())
+    end, root = v, jnp.sqrt(first_metric.diagonal())
     if known:
         # Known velocities may follow from the joints, so the rows may be dependent.
         indices = jnp.asarray(known, int)
@@ -189,7 +193,7 @@ def project_velocity(
         end = jax.lax.scan(toward, end, None, length=4)[0]
     # One correction is exact if the energy is a quadratic form of the momenta. Otherwise
     # the corrections are iterations of Newton's method, which converge quadratically.
-    corrections = 8 if isinstance(model.system, HamiltonianSystem) else 1
+    corrections = 1 if is_quadratic else 8
     regularisation = model.regularisation(unit.size, v.dtype)
     again = lambda v, _: (correct(v, rates, unit, regularisation), v)
     end, before = jax.lax.scan(again, end, None, length=corrections)
