@@ -218,3 +218,17 @@ def test_bodies_in_quaternions_keep_the_angular_momentum_to_second_order(name):
     assert max(drift(energy), drift(linear)) <= 1e-11
     # Truncation: 1e-5 = C h^2 with C = 0.2.
     assert drift(angular) <= 1e-4
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_fixed_body_keeps_the_pose_of_the_start_without_points(dimension):
+    at = [0.3, -0.2, 0.1][:dimension]
+    body = (
+        ej.bodies.PlanarBody("arm", 1.0, 0.1, at, 0.4)
+        if dimension == 2
+        else ej.bodies.RigidBody("arm", 1.0, [0.1, 0.2, 0.15], at)
+    )
+    scene = ej.Scene([body, ej.joints.Fixed("clamp", "ground", "arm")])
+    np.testing.assert_allclose(scene.start().q, scene.q, rtol=0, atol=1e-15)
+    np.testing.assert_array_equal(scene.args["joints"]["clamp"]["point_a"], at)
+    assert max(scene.report(scene.start())["clamp"]) <= 1e-15  # round-off

@@ -81,6 +81,11 @@ def test_numbers_are_found_and_set_by_name_and_differentiated():
         args.set("outer", length=1.0)
     with pytest.raises(ValueError, match="no part 'rod'"):
         args.set("rod", length=1.0)
+    heavier = args.set("outer", mass=3.0) | {"gravity": [0.0, -1.0]}
+    assert float(heavier["bodies"]["outer"]["mass"]) == 3.0
+    np.testing.assert_array_equal(heavier["gravity"], [0.0, -1.0])
+    with pytest.raises(ValueError, match="There is no `g`"):
+        args | {"g": 1.0}
 
 
 def constraint(scene):

@@ -19,7 +19,8 @@ class Parameters(eqx.Module):
 
     They are read as `args["bodies"]["crank"]["mass"]`, `args["joints"]["pin"]["point_b"]`,
     `args["forces"]["spring"]["stiffness"]` or `args["gravity"]`, and those that you passed
-    to the scene as `args` by their own names. `set` returns a copy with other values. The
+    to the scene as `args` by their own names. `set` returns a copy with other values, and
+    `args | {"k": 2.0}` one with other numbers of your own, as for a dictionary. The
     leaves of this pytree are tables with one row for each part of a kind, so that a hundred
     rods need no larger program than one. Gradients are read by name too.
     """
@@ -33,6 +34,9 @@ class Parameters(eqx.Module):
 
     def __setitem__(self, key: str, value: Any) -> NoReturn:
         _refuse(key)
+
+    def __or__(self, other: Mapping[str, Any]) -> "Parameters":
+        return self.set(**other) if isinstance(other, Mapping) else NotImplemented
 
     def __str__(self) -> str:
         lines = [f"{key} = {_text(value)}" for key, value in self.own.items()]

@@ -150,12 +150,15 @@ class Planar(AbstractAxisJoint):
 class Fixed(AbstractPointJoint):
     """Holds two bodies in the relative pose of the start.
 
-    Three constraints in the plane, six in space.
+    Three constraints in the plane, six in space. The point, if none is passed, is the
+    origin of the second body. If both are passed, they must coincide.
     """
 
     def resolve(self, ends: Ends) -> tuple[AbstractConstraintLaw, Numbers]:
         axis = [1.0, 0.0, 0.0][: ends.dimension]
-        numbers = ends.points(self.point_a, self.point_b) | ends.axes(axis)
+        is_given = self.point_a is not None or self.point_b is not None
+        point_b = self.point_b if is_given else [0.0] * ends.dimension
+        numbers = ends.points(self.point_a, point_b) | ends.axes(axis)
         if ends.dimension == 2:
             return Alignment(None, ((0, 1),)), numbers
         return Alignment(None, SAME_DIRECTIONS, keeps="directions"), numbers
