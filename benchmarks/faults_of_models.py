@@ -25,8 +25,8 @@ FAULTS = (
     Fault(
         "projection: one correction of momenta",
         "_analysis/projection.py",
-        "8 if isinstance(model.system, HamiltonianSystem) else 1",
-        "1",
+        "corrections = 1 if is_quadratic else 8",
+        "corrections = 1",
         "Momenta whose energy is not quadratic do not satisfy the velocity level.",
         of("general_energies::test_a_relativistic_start_is_made_consistent"),
     ),

@@ -200,6 +200,24 @@ FAULTS = (
         of("machine_code::test_lanes_are_not_along_an_axis_that_is_summed"),
     ),
     Fault(
+        "summands: no factors",
+        "_programs/summands.py",
+        "return tuple(factor * term for term in x.terms)",
+        "return x.terms",
+        "The terms of a potential without their factors, in forces of large systems.",
+        of("summands::test_all_terms_of_a_sum_are_found"),
+    ),
+    Fault(
+        "summands: one correction",
+        "_operators/elements.py",
+        "    return [found] if is_sparse else None",
+        "    return None",
+        "Dense Jacobians for plain potentials, which take twenty times as long.",
+        of(
+            "summands::test_newtons_method_eliminates_blocks_where_a_plain_potential_is_a_sum"
+        ),
+    ),
+    Fault(
         "rows: order of bundles",
         "_solvers/linear/schur.py",
         "at_places(jnp.concatenate(found), self.tables.back)",

@@ -1,4 +1,4 @@
-"""Potentials and constraints of large systems as sums over elements, such as springs."""
+"""Potentials and constraints as sums over elements, such as springs."""
 
 from collections.abc import Callable
 from typing import TypeAlias
@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._discrete import AbstractCorrected
-from .._programs import jacobian_pattern, LARGE
-from .._solvers import RowPattern
+from .._programs import jacobian_pattern, LARGE, summands_of
+from .._solvers import RowPattern, SMALL
 from .._system import Elements, System
 from .._types import Args, Coordinates, Scalar
 from .interval import gradient_with_time, Time
@@ -27,12 +27,29 @@ def has_linear_potential(system: System, q: Coordinates, args: Args) -> bool:
     return hessian is not None and hessian.nnz == 0
 
 
+# The derivatives of all summands take one product for each colour of the columns. With more
+# of them they cost more than the dense Jacobian that they avoid.
+_MOST_COLOURS = 24
+
+
 def element_energies(system: System, q: Coordinates, args: Args) -> list[Summands] | None:
-    """The summands of the potential of a large system, or `None` if they are unknown."""
+    """The summands of the potential of a large system, or `None` if they are unknown.
+
+    Without constraints fewer coordinates are many: there is no chord method then, and
+    Newton's method needs a sparse Jacobian. The summands of a plain function are those of
+    its program.
+    """
     potential = system.potential
-    if q.size <= LARGE or not isinstance(potential, Elements):
+    kinds = system.constraint, system.driven, system.nonholonomic
+    if q.size <= (SMALL if all(x is None for x in kinds) else LARGE):
         return None
-    return [lambda q, part=part: part.each(q, args) for part in potential.parts]
+    if isinstance(potential, Elements):
+        return [lambda q, part=part: part.each(q, args) for part in potential.parts]
+    found = summands_of(lambda q: potential(q, args))
+    if jax.eval_shape(found, q).size < 2:
+        return None
+    is_sparse = RowPattern(found, q, small=0).num_colours <= _MOST_COLOURS
+    return [found] if is_sparse else None
 
 
 def gradient_and_work_by_rows(
@@ -53,7 +70,7 @@ def gradient_and_work_by_rows(
     elif driven is not None:
         fixed = [*fixed, lambda q: driven(q, ta)[None]]
     for fn in fixed:
-        rows = RowPattern(fn, qa)
+        rows = RowPattern(fn, qa, small=0)
         gradients = lambda q, fn=fn, rows=rows: rows.derivative(fn, q)
         by_row = derivative.gradients_of_rows(fn, gradients, rows.own, qa, qb)
         total = total.at[rows.columns].add(by_row)

@@ -46,3 +46,4 @@ from .sparsity.pattern import (
     shape_of as shape_of,
 )
 from .squares import Squares as Squares, squares_in as squares_in
+from .summands import summands_of as summands_of

@@ -44,6 +44,6 @@ class Assembled(eqx.Module):
 
 def row_hessians(fn: Callable[[Array], Array], x: Float[Array, " n"]) -> ElementMatrices:
     """The Hessian of each entry of `fn` with respect to the unknowns it depends on."""
-    pattern = RowPattern(fn, x)
+    pattern = RowPattern(fn, x, small=0)
     gradients = lambda x: pattern.derivative(fn, x)
     return ElementMatrices(Indices(pattern.columns), pattern.derivative(gradients, x))

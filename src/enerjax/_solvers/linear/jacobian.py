@@ -255,13 +255,15 @@ class RowPattern:
     """The unknowns that each entry of a function depends on, found at trace time.
 
     `columns`: the numbers of these unknowns, shape `(m, width)`. Rows with fewer unknowns
-    are padded with zeros.
+    are padded with zeros. It is searched for where there are more unknowns than `small`.
     """
 
-    def __init__(self, fn: Callable[[Array], Array], like: Float[Array, " n"]):
+    def __init__(
+        self, fn: Callable[[Array], Array], like: Float[Array, " n"], small: int = LARGE
+    ):
         size = like.size
         num_rows = jax.eval_shape(lambda x: fn(x), like).shape[0]
-        pattern = jacobian_pattern(lambda x: fn(x), like) if size > LARGE else None
+        pattern = jacobian_pattern(lambda x: fn(x), like) if size > small else None
         if pattern is None:
             self.columns = np.broadcast_to(np.arange(size), (num_rows, size))
             self._colours = np.arange(size)
@@ -275,6 +277,11 @@ class RowPattern:
         self.columns[rows, within] = pattern.indices
         self._nonzero = np.zeros(self.columns.shape)
         self._nonzero[rows, within] = 1
+
+    @property
+    def num_colours(self) -> int:
+        """The number of products that the derivatives of all rows take."""
+        return int(self._colours.max(initial=-1)) + 1
 
     def own(self, x: Float[Array, " n"]) -> Float[Array, "m width"]:
         """The values of the unknowns of each row, padded with zeros."""
