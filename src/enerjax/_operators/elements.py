@@ -35,16 +35,20 @@ _MOST_COLOURS = 24
 def element_energies(system: System, q: Coordinates, args: Args) -> list[Summands] | None:
     """The summands of the potential of a large system, or `None` if they are unknown.
 
-    Without constraints fewer coordinates are many: there is no chord method then, and
-    Newton's method needs a sparse Jacobian. The summands of a plain function are those of
-    its program.
+    Systems without constraints have no chord method, and Newton's method needs a sparse
+    Jacobian. Fewer coordinates are many there, and the summands of a plain function are
+    those of its program. Elsewhere the derivatives of these would cost more than one
+    correction for the whole potential, which the chord method omits.
     """
     potential = system.potential
     kinds = system.constraint, system.driven, system.nonholonomic
-    if q.size <= (SMALL if all(x is None for x in kinds) else LARGE):
+    is_free = all(x is None for x in kinds)
+    if q.size <= (SMALL if is_free else LARGE):
         return None
     if isinstance(potential, Elements):
         return [lambda q, part=part: part.each(q, args) for part in potential.parts]
+    if not is_free:
+        return None
     found = summands_of(lambda q: potential(q, args))
     if jax.eval_shape(found, q).size < 2:
         return None
