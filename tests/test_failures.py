@@ -256,3 +256,6 @@ def test_derivatives_of_a_failed_run_raise():
         assert np.all(np.isfinite(derivative(start.v, 0.01)))
         with pytest.raises(Exception, match="Newton's method|right angle"):
             jax.block_until_ready(derivative(start.v, 1.5))
+    # Outside of `jit` the values are known, and the error is that of a run.
+    with pytest.raises(RuntimeError, match="failed in step 1, from t = 0 to 1.5"):
+        jax.grad(end)(start.v, 1.5)

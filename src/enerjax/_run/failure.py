@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from .._analysis import mobility
-from .._programs import is_known, raising
+from .._programs import is_known, raising, values_of
 from .._results import RESULTS
 from .._system import AbstractSystem
 from .._types import Args, Flag, Scalar
@@ -31,10 +31,14 @@ def raise_failure(
     `reached` is the time that the run has reached, `h` the length of its steps if all have
     the same.
     """
-    if not is_known((solution, failed, args, reached, h)):
-        return raising(lambda x: solution.result.error_if(x, failed), solution)
-    if not failed:
+    # The values are known in a call inside of `jax.grad` too.
+    is_failure = values_of(failed)
+    if is_known(is_failure) and not is_failure:
         return solution
+    known = values_of((solution, args, reached, h))
+    if not is_known((is_failure, known)):
+        return raising(lambda x: solution.result.error_if(x, failed), solution)
+    solution, args, reached, h = known
     num_completed = int(solution.stats.completed_steps)
     begin = float(reached)
     if solution.result == RESULTS.interrupted:
