@@ -228,11 +228,11 @@ def _disagreement(
     The curve is the first of `moves` whose starts can be made consistent: the rods of a
     long chain may be too short beside its coordinates to move these.
     """
+    off: list[float] = []
     for moved in moves:
-        found = [_difference(value, moved, gradient, eps) for eps in _STEPS]
-        off = [x for x in found if x is not None]
-        if off:
-            break
+        if not off:
+            found = [_difference(value, moved, gradient, eps) for eps in _STEPS]
+            off = [x for x in found if x is not None]
     # Long steps have an error of truncation, short ones one of round-off.
     least = min(off, default=np.nan)
     if not least < _OFF:

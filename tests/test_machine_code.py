@@ -702,8 +702,12 @@ def neighbours_of_which_the_last_is_computed_later(x):
     """The first of eight numbers follows eight others from which it is computed."""
     first = jnp.sin(jnp.resize(x.ravel(), (8,)) + jnp.linspace(0, 0.1, 8))
     both = jnp.concatenate([first, jnp.cos(first) * jnp.sum(first**2)])
-    columns = np.array([[k, 5, 6, 7, 8] for k in range(5)])
-    return both[columns.T] ** 2
+    without = np.array([[k, 5, 6, 7, (k + 1) % 5] for k in range(5)])
+    with_last = np.array([[k, 5, 6, 7, 8] for k in range(5)])
+    all_neighbours = np.arange(3, 8)[:, None] + np.arange(5)[None]
+    # The same cells are read first without the last number, and then with it.
+    columns = np.concatenate([without, with_last, all_neighbours])
+    return jnp.stack([both[x.T] ** 2 for x in columns.reshape(3, 5, 5)])
 
 
 @pytest.mark.parametrize(
@@ -791,6 +795,12 @@ def test_lanes_are_not_along_an_axis_that_is_summed():
     nodes = [x for region in regions for x in region.found.values()]
     assert [x for x in nodes if x.lanes and x.op == "mul"]
     assert not [x for x in nodes if x.is_reduced]
+
+
+def test_a_sum_of_one_known_number():
+    fn = lambda x: jnp.sum(2.0) * x + jnp.mean(np.float64(3.0))
+    assert is_compiled(in_one_function(fn), X)
+    np.testing.assert_array_equal(jax.jit(in_one_function(fn))(X), 2.0 * X + 3.0)
 
 
 def test_numbers_of_lanes_begin_with_a_line_of_the_cache():

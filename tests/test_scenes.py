@@ -85,7 +85,7 @@ def test_numbers_are_found_and_set_by_name_and_differentiated():
     assert float(heavier["bodies"]["outer"]["mass"]) == 3.0
     np.testing.assert_array_equal(heavier["gravity"], [0.0, -1.0])
     with pytest.raises(ValueError, match="There is no `g`"):
-        args | {"g": 1.0}
+        _ = args | {"g": 1.0}
 
 
 def constraint(scene):

@@ -185,8 +185,11 @@ def _start(
 
 
 class _Facts(NamedTuple):
-    """Whether a start satisfies the constraints, and whether it satisfies their rates, to
-    round-off. Neither is said of one whose constraints are not independent."""
+    """Whether a start satisfies the constraints, and their rates too, to round-off.
+
+    Both are false where constraints are not independent, unless the system says that they
+    may be redundant.
+    """
 
     has_position: Flag
     has_velocity: Flag

@@ -90,7 +90,10 @@ def _product(inputs: list[_Known]) -> tuple[Any, ...] | None:
 
 def _quotient(inputs: list[_Known]) -> tuple[Any, ...] | None:
     above, below = inputs
-    return None if below.varies else _scaled(above, 1.0 / below.value)
+    # Quotients of whole numbers are rounded.
+    if below.varies or not jnp.issubdtype(jnp.result_type(below.value), jnp.inexact):
+        return None
+    return _scaled(above, 1.0 / below.value)
 
 
 def _contraction(inputs: list[_Known]) -> tuple[Any, ...] | None:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.extend.core import Literal
+from jax.extend.core import Literal, Var
 
 from ..jaxprs import programs_within, solution_program, wrapped_program
 from ..numpy_primitives import BY_NUMPY, evaluated, moved, MOVES
@@ -72,11 +72,10 @@ class Evaluation:
             if not isinstance(x, Literal)
         )
 
-        self._sums |= {
-            eqn.invars[0]: eqn.params["axes"]
-            for eqn in jaxpr.eqns
-            if eqn.primitive.name == "reduce_sum" and uses[eqn.invars[0]] == 1
-        }
+        for eqn in jaxpr.eqns:
+            summed = eqn.invars[0] if eqn.primitive.name == "reduce_sum" else None
+            if isinstance(summed, Var) and uses[summed] == 1:
+                self._sums[summed] = eqn.params["axes"]
 
         def read(atom: Any) -> Value:
             if isinstance(atom, Literal):

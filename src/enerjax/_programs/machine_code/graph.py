@@ -160,7 +160,8 @@ class Graph:
         """A node of a region, not before a level."""
         key = op, dtype, tuple(map(_identity, operands)), extra, lanes, is_reduced
         found = region.found.get(key)
-        if found is None:
+        # One may be found that uses fewer of its cells, and does not wait for the others.
+        if found is None or found.level < level:
             self.count += 1
             found = Node(
                 op, dtype, operands, extra, lanes, region, level, self.count, is_reduced

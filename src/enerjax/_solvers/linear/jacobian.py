@@ -255,7 +255,8 @@ class RowPattern:
     """The unknowns that each entry of a function depends on, found at trace time.
 
     `columns`: the numbers of these unknowns, shape `(m, width)`. Rows with fewer unknowns
-    are padded with zeros. It is searched for where there are more unknowns than `small`.
+    are padded with their first one, which couples them to no others. The pattern is
+    searched for where there are more unknowns than `small`.
     """
 
     def __init__(
@@ -273,7 +274,9 @@ class RowPattern:
         counts = np.diff(pattern.indptr)
         rows = np.repeat(np.arange(num_rows), counts)
         within = np.arange(rows.size) - np.repeat(pattern.indptr[:-1], counts)
-        self.columns = np.zeros((num_rows, max(counts.max(initial=0), 1)), int)
+        first = np.append(pattern.indices, 0)[pattern.indptr[:-1]] * (counts > 0)
+        width = max(counts.max(initial=0), 1)
+        self.columns = np.repeat(first[:, None], width, axis=1)
         self.columns[rows, within] = pattern.indices
         self._nonzero = np.zeros(self.columns.shape)
         self._nonzero[rows, within] = 1
