@@ -163,7 +163,7 @@ def project_velocity(
     eps = jnp.finfo(v.dtype).eps
     unit = model.scales.constraint[:num_rates]
     at = lambda v: model.inverse_regular_metric(State(q, v))
-    # Otherwise the metric depends on the momenta.
+    # The metric of other systems does not depend on the velocities.
     is_quadratic = not isinstance(model.system, HamiltonianSystem)
     first_metric = at(v)
 

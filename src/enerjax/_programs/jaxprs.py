@@ -70,6 +70,21 @@ def interpret(
     return list(map(read, jaxpr.outvars))
 
 
+def interpret_within_jit(
+    jaxpr: Any,
+    consts: list[Any],
+    inputs: list[Any],
+    equation: Callable[[Any, list[Any]], list[Any]],
+) -> list[Any]:
+    """`interpret`, where the programs of `jit` within the program are interpreted too."""
+
+    def within(eqn: Any, values: list[Any]) -> list[Any]:
+        inner = wrapped_program(eqn) if eqn.primitive.name in JIT else None
+        return equation(eqn, values) if inner is None else interpret(*inner, values, within)
+
+    return interpret(jaxpr, consts, inputs, within)
+
+
 def evaluate(primitive: Any, values: list[Any], params: dict[str, Any]) -> list[Any]:
     """The outputs of a primitive, as a list."""
     bound = primitive.get_bind_params(params)

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .jaxprs import evaluate, interpret, wrapped_program
-from .primitives import CONTRACTION, JIT
+from .jaxprs import evaluate, interpret_within_jit
+from .primitives import CONTRACTION
 from .simplification import simplified
 
 
@@ -29,8 +29,8 @@ def squares_in(fn: Callable[[Array], Array], x: Array) -> list[Squares]:
     """The squares that `fn(x)` sums, beside other terms."""
     # Equal operations must be one, or factors of a square would not be the same array.
     closed = jax.make_jaxpr(simplified(fn))(x)
-    known = [_Known(value, False) for value in closed.consts]
-    (out,) = interpret(closed.jaxpr, known, [_Known(x, True)], _equation)
+    inputs = [_Known(x, True)]
+    (out,) = interpret_within_jit(closed.jaxpr, closed.consts, inputs, _equation)
     return [
         Squares(jnp.broadcast_to(term.coefficient, jnp.shape(term.value)), term.value)
         for term in _as_known(out).terms
@@ -69,11 +69,6 @@ def _as_known(x: Any) -> _Known:
 
 def _equation(equation: Any, inputs: list[Any]) -> list[_Known]:
     inputs = list(map(_as_known, inputs))
-    inner = wrapped_program(equation) if equation.primitive.name in JIT else None
-    if inner is not None:
-        program, consts = inner
-        known = [_Known(value, False) for value in consts]
-        return list(map(_as_known, interpret(program, known, inputs, _equation)))
     values = [x.value for x in inputs]
     outs = evaluate(equation.primitive, values, equation.params)
     if not any(x.varies for x in inputs):

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .jaxprs import evaluate, interpret, wrapped_program
-from .primitives import CONTRACTION, JIT
+from .jaxprs import evaluate, interpret_within_jit
+from .primitives import CONTRACTION
 
 
 def summands_of(
@@ -26,8 +26,8 @@ def summands_of(
 
     def terms(x: Array) -> Array:
         closed = jax.make_jaxpr(fn)(x)
-        known = [_Known(value, False) for value in closed.consts]
-        (out,) = interpret(closed.jaxpr, known, [_Known(x, True)], _equation)
+        inputs = [_Known(x, True)]
+        (out,) = interpret_within_jit(closed.jaxpr, closed.consts, inputs, _equation)
         parts = [part.ravel() for part in _as_known(out).terms]
         return jnp.concatenate([*parts, jnp.zeros((0,), x.dtype)])
 
@@ -59,11 +59,6 @@ def _as_known(x: Any) -> _Known:
 
 def _equation(equation: Any, inputs: list[Any]) -> list[_Known]:
     inputs = list(map(_as_known, inputs))
-    inner = wrapped_program(equation) if equation.primitive.name in JIT else None
-    if inner is not None:
-        program, consts = inner
-        known = [_Known(value, False) for value in consts]
-        return list(map(_as_known, interpret(program, known, inputs, _equation)))
     outs = evaluate(equation.primitive, [x.value for x in inputs], equation.params)
     varies = any(x.varies for x in inputs)
     rule = _RULES.get(equation.primitive.name)
