@@ -168,23 +168,30 @@ def _across(stages: Stages, numbers: Numbers) -> Multipliers:
 
 @dataclass(frozen=True)
 class ChainTurn(AbstractTurn):
-    """The angle of a hinge in a chain.
+    """The angle of a hinge in a chain of three.
 
-    It is the angle from `numbers["zero"]`, a direction across the axis in the stage before
-    the hinge, to `numbers["turned"]`, one in the stage behind it.
+    That of the second hinge is the angle from the first axis to the last, as they are seen
+    along the second, less a constant whose cosine and sine are `numbers["turn"]`. That of
+    another hinge is the angle of the second axis from `numbers["zero"]`, in the body where
+    the axis of the hinge is fixed, to `numbers["across"]`.
 
-    - `number`: that of the hinge among those of the chain, from 0.
+    - `number`: that of the hinge, from 0.
     """
 
     chain: Chain
     number: int
 
     def components(self, a: Frame, b: Frame, numbers: Numbers) -> tuple[Scalar, Scalar]:
-        stages = Stages(self.chain, a, b, numbers)
-        zero = stages.direction(self.number, numbers["zero"])
-        turned = stages.direction(self.number + 1, numbers["turned"])
-        across = jnp.cross(stages.axes[self.number], zero)
-        return jnp.sum(turned * zero), jnp.sum(turned * across)
+        first, middle, last = Stages(self.chain, a, b, numbers).axes
+        if self.number != 1:
+            body = a if self.number == 0 else b
+            zero, across = (body.direction(numbers[key]) for key in ("zero", "across"))
+            return jnp.sum(middle * zero), jnp.sum(middle * across)
+        to_first, to_last = numbers["cosines"]
+        along = jnp.sum(first * last) - to_first * to_last
+        across = jnp.sum(middle * jnp.cross(first, last))
+        c, s = numbers["turn"]
+        return along * c + across * s, across * c - along * s
 
 
 @dataclass(frozen=True)

@@ -97,17 +97,23 @@ def _hinge(here: Attached, labels: list[str], names: Names) -> tuple[list, list]
     points = dict(
         point_a=here.outer.point(here.points[0]), point_b=here.own.point(here.points[0])
     )
-    (axis,), (zero,) = here.axes, here.zeros
+    frames = _frames_of_hinge(here, 0)
+    law = Alignment(None, SAME_AXIS, Turn(), "axis")
+    ends = labels[0], here.outer.body, here.name
+    joint = parts.Hinge(*ends, law, points | frames(0.0))
+    return [joint], [Coordinate(here.joints[0], *ends, Turn(), frames)]
+
+
+def _frames_of_hinge(here: Attached, k: int) -> Callable[[float], Numbers]:
+    """The axes of one hinge, as a function of the coordinate at which they coincide."""
+    axis, zero = here.axes[k], here.zeros[k]
 
     def frames(value: float) -> Numbers:
         rows = basis(axis)
         turned = [_rotated(row, axis, zero - value) for row in rows]
         return dict(frame_a=_all(here.outer, rows), frame_b=_all(here.own, turned))
 
-    law = Alignment(None, SAME_AXIS, Turn(), "axis")
-    ends = labels[0], here.outer.body, here.name
-    joint = parts.Hinge(*ends, law, points | frames(0.0))
-    return [joint], [Coordinate(here.joints[0], *ends, Turn(), frames)]
+    return frames
 
 
 def _slide(here: Attached, labels: list[str], names: Names) -> tuple[list, list]:
@@ -147,10 +153,10 @@ def _chain(here: Attached, labels: list[str], names: Names) -> tuple[list, list]
     for k, label in enumerate(labels):
         if here.kinds[k] == "ball":
             continue
-        measure, own = geometry.coordinate(k)
-        at = lambda value, own=own: numbers | own(value)
-        coordinates.append(Coordinate(here.joints[k], label, *ends, measure, at))
-        found.append(parts.Coordinate(label, *ends, ChainCoordinate(measure), at(0.0)))
+        own = geometry.coordinate(k, label)
+        coordinates.append(own)
+        law = ChainCoordinate(own.measure)
+        found.append(parts.Coordinate(label, own.a, own.b, law, own.numbers(0.0)))
     return found, coordinates
 
 
@@ -234,22 +240,71 @@ class ChainGeometry:
         normals = np.linalg.svd(slides)[2][len(slides) :]
         return dict(slides=slides, normals=normals, duals=np.linalg.pinv(slides).T)
 
-    def coordinate(self, k: int) -> tuple[AbstractMeasure, Callable[[float], Numbers]]:
-        """The measure of one joint, and its own numbers so that it vanishes at a value."""
-        zero, axis = self.here.zeros[k], self.here.axes[k]
+    def coordinate(self, k: int, label: str) -> Coordinate:
+        """The coordinate of one joint, which is no ball."""
+        here, zero = self.here, self.here.zeros[k]
+        ends = here.joints[k], label, here.outer.body, here.name
         if k in self.slides:
             measure = ChainSlide(self.chain, self.slides.index(k))
-            return measure, lambda value: dict(zero=zero - value)
-        stage, across = self.hinges.index(k), basis(axis)[0]
-
-        def numbers(value: float) -> Numbers:
-            turned = _rotated(across, axis, zero - value)
-            return dict(
-                zero=self._in_stage(stage, across),
-                turned=self._in_stage(stage + 1, turned),
+            return Coordinate(
+                *ends, measure, lambda value: self.numbers() | dict(zero=zero - value)
             )
+        number = self.hinges.index(k)
+        if len(self.hinges) == 1:
+            return Coordinate(*ends, Turn(), _frames_of_hinge(here, k))
+        if len(self.hinges) == 2:
+            return self._of_two(number, ends)
+        own = self._turn_between if number == 1 else self._turn_at_end
+        measure = ChainTurn(self.chain, number)
+        return Coordinate(*ends, measure, lambda value: self.numbers() | own(k, value))
 
-        return ChainTurn(self.chain, stage), numbers
+    def _of_two(self, number: int, ends: tuple[int, str, str, str]) -> Coordinate:
+        """The coordinate of one of two hinges: the angle of the axis of the other one in
+        the body where its own axis is fixed, which comes first."""
+        joint, label, outer, own = ends
+        here, is_first = self.here, number == 0
+        k, other = self.hinges[number], self.hinges[1 - number]
+        places = (here.outer, here.own) if is_first else (here.own, here.outer)
+        bodies = (outer, own) if is_first else (own, outer)
+        turned = basis(here.axes[other])[[2, 0, 1]]
+
+        def frames(value: float) -> Numbers:
+            x, y = self._seen_from(k, other, value, is_first)
+            rows = x, y, np.cross(x, y)
+            return dict(frame_a=_all(places[0], rows), frame_b=_all(places[1], turned))
+
+        return Coordinate(joint, label, *bodies, Turn(), frames)
+
+    def _turn_at_end(self, k: int, value: float) -> Numbers:
+        """The numbers of the angle of the first or the last of three hinges."""
+        is_first = k == self.hinges[0]
+        rows = self._seen_from(k, self.hinges[1], value, is_first)
+        place = self.here.outer if is_first else self.here.own
+        zero, across = _all(place, rows)
+        return dict(zero=zero, across=across)
+
+    def _turn_between(self, k: int, value: float) -> Numbers:
+        """The numbers of the angle of the second of three hinges."""
+        first, axis, last = self.here.axes[self.hinges]
+        along = first @ last - (first @ axis) * (axis @ last)
+        at_rest = np.arctan2(axis @ np.cross(first, last), along)
+        angle = at_rest + value - self.here.zeros[k]
+        return dict(turn=np.array([np.cos(angle), np.sin(angle)]))
+
+    def _seen_from(
+        self, k: int, other: int, value: float, is_first: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Where the axis of an `other` hinge is seen along the axis of the hinge `k` when
+        the coordinate has a value, and the direction in which it turns from there.
+
+        They are unit vectors of the file's body in its rest pose, and fixed in the body
+        before the hinge if this `is_first`, else in the one behind it.
+        """
+        axis, zero = self.here.axes[k], self.here.zeros[k]
+        seen = self.here.axes[other] - axis @ self.here.axes[other] * axis
+        sign = 1 if is_first else -1
+        x = _rotated(seen / np.linalg.norm(seen), axis, sign * (value - zero))
+        return x, sign * np.cross(axis, x)
 
     def _in_stage(self, stage: int, x: np.ndarray) -> np.ndarray:
         """A direction of the file's body in its rest pose, in the axes of a stage."""
