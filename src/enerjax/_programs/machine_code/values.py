@@ -22,6 +22,9 @@ from .graph import as_number, Graph, Node, Number, Region
 # Arrays with no more entries are not computed lane by lane unless they are vectors of many,
 # and neither are those whose longest axis is shorter.
 _SMALL, _MANY, _FEWEST_LANES = 24, 8, 5
+# The numbers of a vector of the processor: so many lanes are enough where none is put
+# together from single numbers.
+_VECTOR = 4
 # The most nodes of one array; larger arrays are computed as one axis of lanes.
 MOST_CELLS = 1_600
 # Cells from this number on hold constants.
@@ -603,13 +606,19 @@ def lane_of(
             # operations.
             if 2 * value.n > longest and value.lane not in summed:
                 return value.lane
-    return usual_lane(shape, summed)
+    # Numbers that were computed one by one would have to be put together first.
+    is_single = all(isinstance(x, Cells) and x.lane is None for x in values)
+    return usual_lane(shape, summed, _FEWEST_LANES if is_single else _VECTOR)
 
 
-def usual_lane(shape: tuple[int, ...], summed: Sequence[int] = ()) -> int | None:
+def usual_lane(
+    shape: tuple[int, ...], summed: Sequence[int] = (), fewest: int = _FEWEST_LANES
+) -> int | None:
+    """The longest of the axes along which an array is not `summed`, if it has the `fewest`
+    entries, or more."""
     lengths = [0 if k in summed else n for k, n in enumerate(shape)]
     size, longest = int(np.prod(shape)), max(lengths, default=0)
-    if longest < _FEWEST_LANES or (size <= _SMALL and longest < _MANY):
+    if longest < fewest or (size <= _SMALL and longest < _MANY):
         return None
     return lengths.index(longest)
 
