@@ -32,7 +32,11 @@ from .machine_code import (
     part as part,
     why_not_one_function as why_not_one_function,
 )
-from .places import at_places as at_places, with_any as with_any
+from .places import (
+    at_all_places as at_all_places,
+    at_places as at_places,
+    with_any as with_any,
+)
 from .raising import raising as raising
 from .simplification import simplified as simplified
 from .sparsity.jacobian_columns import (

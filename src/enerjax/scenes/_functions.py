@@ -20,7 +20,7 @@ from ._laws import AbstractForceLaw, Acting, Driven, Gap
 from ._layout import Layout, Links
 from ._motion_view import Moving
 from ._parameters import Parameters
-from ._pose_view import evaluate, evaluate_slip, lift, View
+from ._pose_view import evaluate, evaluate_all, evaluate_slip, lift, View
 from ._potential import PotentialOfScene
 from ._user_functions import ask, vector_of
 
@@ -90,16 +90,11 @@ def kinetic(layout: Layout, v: Velocities, args: Parameters) -> Scalar:
 
 def constraint(layout: Layout, q: Coordinates, args: Parameters) -> Multipliers:
     view = View(layout, q)
-    parts = [
-        evaluate(group, view, numbers).reshape(-1)
-        for group, numbers in zip(layout.joint_groups, args.tables["joints"], strict=True)
-    ]
-    parts += [vector_of(name, fn, view, args) for name, fn in layout.constraints]
-    parts += [
-        evaluate(group, view, numbers).reshape(-1)
-        for group, numbers in inerters_at(layout, q, args)
-    ]
-    return jnp.concatenate(parts)
+    joints = list(zip(layout.joint_groups, args.tables["joints"], strict=True))
+    rows = evaluate_all([*joints, *inerters_at(layout, q, args)], view)
+    parts = [x.reshape(-1) for x in rows]
+    own = [vector_of(name, fn, view, args) for name, fn in layout.constraints]
+    return jnp.concatenate([*parts[: len(joints)], *own, *parts[len(joints) :]])
 
 
 def no_slip(layout: Layout, q: Coordinates, args: Parameters) -> Float[Array, "k nq"]:
@@ -138,11 +133,8 @@ def internal(layout: Layout, q: Coordinates) -> Multipliers:
 
 def driven(layout: Layout, q: Coordinates, t: Scalar, args: Parameters) -> Multipliers:
     view = View(layout, q)
-    parts = [
-        evaluate(group, view, numbers).reshape(-1)
-        for group, numbers in drives_at(layout, t, args)
-    ]
-    return jnp.concatenate(parts)
+    rows = evaluate_all(drives_at(layout, t, args), view)
+    return jnp.concatenate([x.reshape(-1) for x in rows])
 
 
 def drives_at(
@@ -189,7 +181,7 @@ def force(
     ]
 
     def measures(x: Coordinates) -> list[Array]:
-        return [evaluate(group, View(layout, x), numbers) for group, numbers in groups]
+        return evaluate_all(groups, View(layout, x))
 
     def rates(v: Velocities) -> list[Array]:
         return jax.jvp(measures, (q,), (lift(layout, q, v),))[1]

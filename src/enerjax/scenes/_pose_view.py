@@ -1,13 +1,15 @@
 """The positions and orientations of bodies for the coordinates of a scene."""
 
+from collections.abc import Iterable, Sequence
 from functools import cached_property
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._programs import at_places, is_known
+from .._programs import at_all_places, at_places, is_known
 from .._types import Coordinates, Scalar, Vector, Velocities
 from ._frames import Frame, Point
 from ._laws import AbstractNonholonomicLaw
@@ -17,6 +19,14 @@ from ._layout import Layout, Links
 # Of more bodies than this, frames of less than this part are computed for these bodies
 # alone: a pin at one end of a beam needs no axes of all of its sections.
 _MANY, _FEW = 16, 0.25
+# The property of a view that contains each field of all frames.
+_TABLES = dict(origin="origins", axes="axes", angle="angles")
+
+
+def _of_ground(field: str, dimension: int, dtype: Any) -> np.ndarray:
+    """A field of the frame of the ground."""
+    fields = dict(origin=np.zeros(dimension), axes=np.eye(dimension), angle=np.zeros(()))
+    return fields[field].astype(dtype)
 
 
 class View:
@@ -44,13 +54,8 @@ class View:
 
     def _table(self, field: str, only: np.ndarray | None = None) -> Array:
         """A field of the ground and of all bodies, or of `only` these, in their order."""
-        dimension, dtype = self.layout.dimension, self.q.dtype
-        of_ground = {
-            "origin": np.zeros((1, dimension)),
-            "axes": np.eye(dimension)[None],
-            "angle": np.zeros((1,)),
-        }
-        parts, first = [of_ground[field].astype(dtype)], 1
+        ground = _of_ground(field, self.layout.dimension, self.q.dtype)
+        parts, first = [ground[None]], 1
         for group in self.layout.body_groups:
             count = len(group.names)
             chosen = np.arange(count) if only is None else only - first
@@ -61,29 +66,43 @@ class View:
                 parts.append(jax.vmap(getattr(group.kind, field))(q))
         return jnp.concatenate(parts)
 
-    def _of(self, field: str, table: str, bodies: np.ndarray) -> Array:
-        """A field of some bodies, stacked; that of a few is computed for these alone."""
-        few, count = np.unique(bodies[bodies > 0]), len(self.layout.turning)
-        if count <= _MANY or few.size > _FEW * count:
-            return at_places(getattr(self, table), bodies)
-        found = self._table(field, few)
-        return at_places(found, np.where(bodies > 0, 1 + np.searchsorted(few, bodies), 0))
-
     def frames(self, bodies: np.ndarray, reads: tuple[str, ...]) -> Frame:
         """The frames of some bodies, stacked, with the fields that are read."""
-        fields = {}
-        if "origin" in reads:
-            fields["origin"] = self._origins_of(bodies)
-        if "axes" in reads and self.layout.turning[bodies].any():
-            fields["axes"] = self._of("axes", "axes", bodies)
-        if "angle" in reads:
-            fields["angle"] = self._of("angle", "angles", bodies)
-        return Frame(**fields)
+        return self.all_frames([(bodies, reads)])[0]
 
-    def _origins_of(self, bodies: np.ndarray) -> Array:
-        if not bodies.any():  # all on the ground
-            return jnp.zeros((bodies.size, self.layout.dimension), self.q.dtype)
-        return self._of("origin", "origins", bodies)
+    def all_frames(
+        self, wanted: Sequence[tuple[np.ndarray, tuple[str, ...]]]
+    ) -> list[Frame]:
+        """`frames` for several arrays of bodies, with the fields that are read of each."""
+        fields: list[dict[str, Array]] = [{} for _ in wanted]
+        for field in _TABLES:
+            read = [k for k, (_, reads) in enumerate(wanted) if field in reads]
+            if field == "axes":
+                read = [k for k in read if self.layout.turning[wanted[k][0]].any()]
+            found = self._of(field, [wanted[k][0] for k in read])
+            for k, x in zip(read, found, strict=True):
+                fields[k][field] = x
+        return [Frame(**own) for own in fields]
+
+    def _of(self, field: str, wanted: Sequence[np.ndarray]) -> list[Array]:
+        """A field of several arrays of bodies, stacked."""
+        moving = [x for x in wanted if x.any()]
+        found = iter(self._of_moving(field, moving) if moving else ())
+        fixed = _of_ground(field, self.layout.dimension, self.q.dtype)
+        return [
+            next(found) if x.any() else jnp.broadcast_to(fixed, (x.size, *fixed.shape))
+            for x in wanted
+        ]
+
+    def _of_moving(self, field: str, wanted: Sequence[np.ndarray]) -> list[Array]:
+        """The same where none is on the ground as a whole. The field of a few bodies is
+        computed for these alone."""
+        few = np.unique(np.concatenate(wanted))
+        few, count = few[few > 0], len(self.layout.turning)
+        if count <= _MANY or few.size > _FEW * count:
+            return at_all_places(getattr(self, _TABLES[field]), wanted)
+        rows = [np.where(x > 0, 1 + np.searchsorted(few, x), 0) for x in wanted]
+        return at_all_places(self._table(field, few), rows)
 
     def frame(self, body: str) -> Frame:
         """The frame of one body, with all its fields."""
@@ -147,8 +166,19 @@ class View:
 
 def evaluate(group: Links, view: View, numbers: dict[str, Array]) -> Array:
     """The values of a law for all its links, one row each."""
-    a, b = (view.frames(bodies, group.law.reads) for bodies in (group.a, group.b))
-    return jax.vmap(group.law)(a, b, numbers)
+    return evaluate_all([(group, numbers)], view)[0]
+
+
+def evaluate_all(
+    groups: Iterable[tuple[Links, dict[str, Array]]], view: View
+) -> list[Array]:
+    """`evaluate` for several groups of links, with the numbers of each."""
+    pairs = list(groups)
+    ends = [(bodies, x.law.reads) for x, _ in pairs for bodies in (x.a, x.b)]
+    frames = iter(view.all_frames(ends))
+    return [
+        jax.vmap(group.law)(next(frames), next(frames), numbers) for group, numbers in pairs
+    ]
 
 
 def evaluate_slip(group: Links, view: View, at: View, numbers: dict[str, Array]) -> Array:

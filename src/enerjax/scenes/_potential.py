@@ -18,7 +18,7 @@ from ._frames import Numbers
 from ._laws import AbstractForceLaw, Elastic
 from ._layout import Layout, Links
 from ._parameters import Parameters
-from ._pose_view import evaluate, View
+from ._pose_view import evaluate_all, View
 from ._user_functions import ask
 
 
@@ -35,10 +35,14 @@ class PotentialOfScene(AbstractStrainEnergy):
 
     def strains(self, q, args=None):
         view = View(self.layout, q)
-        of_springs = []
-        for group, law, numbers in _springs(self.layout, args):
-            measured = evaluate(group._replace(law=law.measure), view, numbers)
-            of_springs.append(jax.vmap(law.strain)(measured, numbers))
+        springs = _springs(self.layout, args)
+        measured = evaluate_all(
+            [(group._replace(law=law.measure), own) for group, law, own in springs], view
+        )
+        of_springs = [
+            jax.vmap(law.strain)(values, numbers)
+            for (_, law, numbers), values in zip(springs, measured, strict=True)
+        ]
         groups = zip(self.layout.beam_groups, args.tables["beams"], strict=True)
         of_beams = [strains(beams, view, numbers) for beams, numbers in groups]
         return (*of_springs, *of_beams)
@@ -73,9 +77,10 @@ def _energy(layout: Layout, q: Coordinates, args: Parameters) -> Scalar:
     energy = jnp.zeros((), q.dtype)
     if layout.has_gravity:
         energy = energy - _weight(view, args)
-    for group, numbers in zip(layout.force_groups, args.tables["forces"], strict=True):
-        if not isinstance(group.law, AbstractForceLaw):
-            energy = energy + jnp.sum(evaluate(group, view, numbers))
+    groups = zip(layout.force_groups, args.tables["forces"], strict=True)
+    elastic = [x for x in groups if not isinstance(x[0].law, AbstractForceLaw)]
+    for values in evaluate_all(elastic, view):
+        energy = energy + jnp.sum(values)
     if layout.beams:
         energy = energy + elastic_energy(layout, view, args)
     if layout.line_loads:

@@ -17,7 +17,7 @@ from ._functions import (
 )
 from ._layout import Layout
 from ._parameters import Parameters
-from ._pose_view import evaluate, evaluate_slip, View
+from ._pose_view import evaluate_all, evaluate_slip, View
 from ._user_functions import vector_of
 
 
@@ -36,16 +36,14 @@ def rows_of(layout: Layout, q: Coordinates, args: Parameters) -> dict[str, slice
     def of_joints(q: Coordinates) -> list[Array]:
         view = View(layout, q)
         groups = zip(layout.joint_groups, args.tables["joints"], strict=True)
-        found = [evaluate(group, view, numbers) for group, numbers in groups]
+        found = evaluate_all(groups, view)
         own = [vector_of(name, fn, view, args) for name, fn in layout.constraints]
         found += [rows[None] for rows in own]
-        pairs = inerters_at(layout, q, args)
-        return found + [evaluate(group, view, numbers) for group, numbers in pairs]
+        return found + evaluate_all(inerters_at(layout, q, args), view)
 
     def of_drives(q: Coordinates) -> list[Array]:
         view = View(layout, q)
-        pairs = drives_at(layout, jnp.zeros((), q.dtype), args)
-        return [evaluate(group, view, numbers) for group, numbers in pairs]
+        return evaluate_all(drives_at(layout, jnp.zeros((), q.dtype), args), view)
 
     shapes = [x.shape for x in jax.eval_shape(of_joints, q)]
     num_joined = len(shapes)

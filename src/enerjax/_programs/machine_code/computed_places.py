@@ -255,6 +255,11 @@ def _places_of_updates(
     return np.where(falls, places, -1).ravel()
 
 
+# The part of all places that may be added up by themselves, and the passes over all places
+# from which on they are.
+_FEW_PLACES, _USUAL_PASSES = 8, 2
+
+
 def _added(self: "Evaluation", operand, updates, places, dtype) -> Value:
     """Updates added to known places."""
     size, count = math.prod(operand.shape), math.prod(updates.shape)
@@ -262,12 +267,12 @@ def _added(self: "Evaluation", operand, updates, places, dtype) -> Value:
     order = order[places[order] >= 0]
     to = places[order]
     before = np.arange(to.size) - np.searchsorted(to, to)
-    repeats = int(before.max(initial=-1)) + 1
     zero = np.zeros((1,), dtype)
     firsts = np.array([0, count, count + 1])
-    # The few places with many updates, such as a body that all others are attached to, are
+    # The few places with many updates, such as a body that many others are attached to, are
     # added up by themselves: passes over all places would be many.
-    often = np.unique(to[before >= 8]) if repeats > 8 else to[:0]
+    passes = np.sort(np.bincount(to, minlength=size))[-1 - size // _FEW_PLACES]
+    often = np.unique(to[before >= max(passes, _USUAL_PASSES)])
     is_often = np.isin(to, often)
     out = operand
     if often.size:
