@@ -1,4 +1,4 @@
-"""The stiffness of strains, as rows beside those of the joints.
+"""The stiffness of strains and the resistance of dampers, as rows beside those of joints.
 
 A strain energy `Gamma . K Gamma / 2` adds about `h^2/4 Gamma'^T K Gamma'` to the inertia of
 a step of length `h`. With `K = R^T R` this is `S^T S`, where the rows of `S` are
@@ -9,6 +9,9 @@ constraint for each row of `S`, which yields to its multiplier `x`:
 
 So stiffness enters the matrix `B M^-1 B^T` of the joints as further rows `S`, with one
 added to their diagonal, and the inertia keeps its blocks.
+
+Dampers with the resistances `c` of measures `Gamma` add `h/2 Gamma'^T c Gamma'`. They are
+taken as strains with the stiffness `2 c / h`.
 """
 
 from collections.abc import Callable
@@ -28,7 +31,7 @@ from .._solvers import (
     SchurTables,
     Symmetric,
 )
-from .._system import AbstractStrainEnergy
+from .._system import AbstractDampedForce, AbstractStrainEnergy, State, System
 from .._types import Args, Coordinates, JointMultipliers, Scalar, Velocities
 
 
@@ -50,15 +53,19 @@ class ElasticTables(NamedTuple):
     """The index tables of the joints, and those of joints and strains together.
 
     The colours of the columns are equal, so one set of products serves both.
+
+    - `has_dampers`: whether there are rows of dampers too.
     """
 
     joints: SchurTables
     both: SchurTables
+    has_dampers: bool
 
     @property
     def description(self) -> str:
         count = self.both.num_rows - self.joints.num_rows
-        return f"{self.both.description}; {count} of the rows are those of strains"
+        what = "strains and dampers" if self.has_dampers else "strains"
+        return f"{self.both.description}; {count} of the rows are those of {what}"
 
     def schurs(
         self,
@@ -80,14 +87,14 @@ class ElasticTables(NamedTuple):
 
 
 def elastic_tables(
-    rates: Rates, num_joints: int, rest: Velocities, weight: Symmetric
+    rates: Rates, num_joints: int, rest: Velocities, weight: Symmetric, has_dampers: bool
 ) -> ElasticTables | None:
     """The tables for `rates`; `None` where the elimination is long, like that of a net."""
     both = schur_tables(rates, rest, weight, bounds=_BOUNDS)
     if both is None:
         return None
     joints = schur_tables(lambda v: rates(v)[:num_joints], rest, weight, both.colours)
-    return None if joints is None else ElasticTables(joints, both)
+    return None if joints is None else ElasticTables(joints, both, has_dampers)
 
 
 class Elasticity(NamedTuple):
@@ -104,6 +111,11 @@ class Elasticity(NamedTuple):
     def num_strains(self) -> int:
         return sum(x.shape[0] * x.shape[1] for x in self.stiffness)
 
+    def with_others(self, others: "Elasticity") -> "Elasticity":
+        """These strains, followed by others."""
+        values = lambda q: [*self.values(q), *others.values(q)]
+        return Elasticity(values, [*self.stiffness, *others.stiffness])
+
 
 def elasticity(potential: Potential, q: Coordinates, args: Args) -> Elasticity:
     """The strains that a potential declares, or the numbers whose squares it sums.
@@ -119,6 +131,23 @@ def elasticity(potential: Potential, q: Coordinates, args: Args) -> Elasticity:
     found = lambda q: squares_in(energy, q)
     values = lambda q: [x.value.reshape(-1, 1) for x in found(q)]
     return Elasticity(values, [2 * x.coefficient.reshape(-1, 1, 1) for x in found(q)])
+
+
+def resistance(system: System, state: State, args: Args, h: Scalar) -> Elasticity:
+    """The measures of the dampers that the force declares, as strains.
+
+    `h` is the length of time whose half multiplies the resistances.
+    """
+    force = system.force
+    if not isinstance(force, AbstractDampedForce) or state.t is None:
+        return Elasticity(lambda q: [], [])
+    found = force.resistances(state.q, state.v, state.t, args, delay=0.5 * h)
+    units = [jnp.eye(_in_rows(x).shape[1], dtype=h.dtype) for x in found]
+    stiffness = [
+        2 / h * _in_rows(x)[:, :, None] * unit for x, unit in zip(found, units, strict=True)
+    ]
+    values = lambda q: [_in_rows(x) for x in force.measures(q, args)]
+    return Elasticity(values, stiffness)
 
 
 def elastic_rates(

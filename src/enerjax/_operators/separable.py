@@ -39,6 +39,7 @@ from .._solvers import (
     Symmetric,
 )
 from .._system import (
+    AbstractDampedForce,
     AbstractKinematics,
     ByRates,
     Frames,
@@ -59,7 +60,14 @@ from .._types import (
 from .action import action_of, gradient_in_rows
 from .base import AbstractModel, Position, Reaction
 from .delassus import DelassusMatrix
-from .elastic import elastic_rates, elastic_tables, elasticity, ElasticTables
+from .elastic import (
+    elastic_rates,
+    elastic_tables,
+    Elasticity,
+    elasticity,
+    ElasticTables,
+    resistance,
+)
 from .elements import (
     element_energies,
     gradient_and_work_by_rows,
@@ -117,7 +125,12 @@ class SeparableModel(AbstractModel):
         self.inverse_inertia = inverse_of(self.inertia)
         self.scales = self._scales(state)
         self.constraint_tables = self._constraint_tables(state)
-        self.elastic_tables = self._elastic_tables(state) if elastic else None
+        # Without dampers if with them the elimination would be long.
+        self.elastic_tables = None
+        if elastic and isinstance(system.force, AbstractDampedForce):
+            self.elastic_tables = self._elastic_tables(state, has_dampers=True)
+        if elastic and self.elastic_tables is None:
+            self.elastic_tables = self._elastic_tables(state, has_dampers=False)
 
     @property
     def has_own_momenta(self) -> bool:
@@ -213,7 +226,7 @@ class SeparableModel(AbstractModel):
         if self.elastic_tables is None:
             return change
         # The chord method does not neglect the part that the strains cause.
-        of_strains, transpose = jax.vjp(self._rates_of_strains(state.q, h), v)
+        of_strains, transpose = jax.vjp(self._rates_of_strains(state, h), v)
         return change - self.inverse_inertia @ transpose(of_strains)[0]
 
     def velocity(self, state: State) -> Velocities:
@@ -463,32 +476,48 @@ class SeparableModel(AbstractModel):
     ) -> Callable[[Velocities], Float[Array, " rows"]]:
         """The rates of the joints, followed by the rows of the strains."""
         joints = self._rates_of_joints(state.q, state.t, None)
-        strains = self._rates_of_strains(state.q, h)
+        strains = self._rates_of_strains(state, h)
         return lambda v: jnp.concatenate([joints(v), strains(v)])
 
     def _rates_of_strains(
-        self, q: Coordinates, h: Scalar
+        self, state: State, h: Scalar
     ) -> Callable[[Velocities], Float[Array, " rows"]]:
-        strains = elasticity(self.system.potential, q, self.args)
-        return elastic_rates(strains, q, h, lambda v: self.lift(q, v))
+        """The rows of the strains, and of the dampers if the chord method has them."""
+        tables = self.elastic_tables
+        strains = self._strains(state, h, tables is not None and tables.has_dampers)
+        return elastic_rates(strains, state.q, h, lambda v: self.lift(state.q, v))
 
-    def _elastic_tables(self, state: State) -> ElasticTables | None:
-        """The tables of joints and strains together.
+    def _strains(self, state: State, h: Scalar, with_dampers: bool) -> Elasticity:
+        strains = elasticity(self.system.potential, state.q, self.args)
+        if not with_dampers:
+            return strains
+        user = self.to_rates(state)
+        return strains.with_others(resistance(self.system, user, self.args, h))
 
-        `None` where there are no strains, where coordinates are redundant, where there are
-        more strains than velocities, and where the elimination would be long: the exact
-        Jacobian is better then.
+    def _elastic_tables(self, state: State, has_dampers: bool) -> ElasticTables | None:
+        """The tables of joints and strains together, and of dampers if `has_dampers`.
+
+        `None` where there are none, where coordinates are redundant, where there are more
+        of them than velocities, and where the elimination would be long: the exact Jacobian
+        is better then.
         """
         q, rest = state.q, jnp.zeros_like(self.inertia.diagonal())
         if self.constraint_tables is None or self._frames(q) is not None:
             return None
-        strains = elasticity(self.system.potential, q, self.args)
+        t = jnp.zeros((), rest.dtype) if self.system.is_timed else None
+        still, unit = State(q, rest, t), jnp.ones((), rest.dtype)
+        strains = self._strains(still, unit, has_dampers)
         if not 0 < strains.num_strains <= rest.size:
             return None
-        t = jnp.zeros((), rest.dtype) if self.system.is_timed else None
-        rates = self._rates_with_strains(State(q, rest, t), jnp.ones((), rest.dtype))
-        num_joints = self.constraint_tables.num_rows
-        return elastic_tables(rates, num_joints, rest, self.inverse_inertia)
+        joints = self._rates_of_joints(q, t, None)
+        rows = elastic_rates(strains, q, unit, lambda v: self.lift(q, v))
+        return elastic_tables(
+            lambda v: jnp.concatenate([joints(v), rows(v)]),
+            self.constraint_tables.num_rows,
+            rest,
+            self.inverse_inertia,
+            has_dampers,
+        )
 
     def _frames(self, q: Coordinates) -> Frames | None:
         """`L` stacked on `B_c`, where coordinates are redundant."""

@@ -21,6 +21,7 @@ from .checks.values import (
     closes_over_traced_values as closes_over_traced_values,
     direction_without_symmetry as direction_without_symmetry,
 )
+from .damping import AbstractDampedForce as AbstractDampedForce
 from .elements import Elements as Elements
 from .kinematics import (
     AbstractKinematics as AbstractKinematics,

@@ -16,13 +16,14 @@ from .._run import Impact
 from .._system import Names, RigidBodies, System
 from .._types import Coordinates, Multipliers, Scalar, Velocities
 from ._beam_functions import numbers_of_bodies
-from ._laws import AbstractForceLaw, Acting, Driven, Gap
+from ._force import ForceOfScene
+from ._laws import Gap
 from ._layout import Layout, Links
-from ._motion_view import Moving
 from ._parameters import Parameters
-from ._pose_view import evaluate, evaluate_all, evaluate_slip, lift, View
+from ._pose_view import evaluate, evaluate_all, evaluate_slip, View
 from ._potential import PotentialOfScene
-from ._user_functions import ask, vector_of
+from ._signals import at_time
+from ._user_functions import vector_of
 
 
 def make_system(layout: Layout, over_constrained: bool, row_names: Sequence[str]) -> System:
@@ -38,7 +39,7 @@ def make_system(layout: Layout, over_constrained: bool, row_names: Sequence[str]
         eqx.Partial(constraint, layout) if layout.has_constraints else None,
         kinematics=eqx.Partial(velocity_map, layout) if redundant else None,
         coordinate_constraint=eqx.Partial(redundancy, layout) if redundant else None,
-        force=eqx.Partial(force, layout) if layout.has_pushes else None,
+        force=ForceOfScene(layout) if layout.has_pushes else None,
         driven=eqx.Partial(driven, layout) if layout.drives else None,
         nonholonomic=eqx.Partial(no_slip, layout) if layout.nonholonomic_groups else None,
         redundant=over_constrained,
@@ -143,58 +144,6 @@ def drives_at(
     """All drives, with numbers that include the values that they prescribe at time `t`."""
     groups = zip(layout.drive_groups, args.tables["drives"], strict=True)
     return [(group, at_time(group, numbers, t, args)) for group, numbers in groups]
-
-
-def at_time(
-    group: Links,
-    numbers: dict[str, Array],
-    t: Scalar,
-    args: Parameters,
-    view: Moving | None = None,
-) -> dict[str, Array]:
-    """The numbers of a group, with the value of its signal if it has one.
-
-    All links of a group have the same signal. Those of forces may depend on the `view`.
-    """
-    if not isinstance(group.law, Acting | Driven):
-        return numbers
-    feedback = isinstance(group.law, Acting) and group.law.feedback
-    inputs = (view, t, args) if feedback else (t, args)
-    value = jnp.asarray(ask(group.names[0], group.law.signal, *inputs)).astype(t.dtype)
-    wanted = (args.layout.dimension,) if group.law.measure.is_vector else ()
-    if value.shape != wanted:
-        raise ValueError(
-            f"The function of '{group.names[0]}' must return "
-            f"{f'shape {wanted}' if wanted else 'a scalar'}, got shape {value.shape}."
-        )
-    return numbers | dict(value=jnp.broadcast_to(value, (len(group.names), *wanted)))
-
-
-def force(
-    layout: Layout, q: Coordinates, v: Velocities, t: Scalar, args: Parameters
-) -> Velocities:
-    view = Moving(layout, q, v, args)
-    groups = [
-        (group, at_time(group, numbers, t, args, view))
-        for group, numbers in zip(layout.push_groups, args.tables["forces"], strict=True)
-        if group is not None
-    ]
-
-    def measures(x: Coordinates) -> list[Array]:
-        return evaluate_all(groups, View(layout, x))
-
-    def rates(v: Velocities) -> list[Array]:
-        return jax.jvp(measures, (q,), (lift(layout, q, v),))[1]
-
-    now, pull = jax.vjp(rates, v)
-    return pull([pushes(*pair, view, x) for pair, x in zip(groups, now, strict=True)])[0]
-
-
-def pushes(group: Links, numbers: dict[str, Array], view: View, rate: Array) -> Array:
-    """The forces of all links along their measures."""
-    assert isinstance(group.law, AbstractForceLaw)
-    a, b = (view.frames(bodies, group.law.reads) for bodies in (group.a, group.b))
-    return jax.vmap(group.law.force)(a, b, rate, numbers)
 
 
 def velocity_map(layout: Layout, q: Coordinates, args: Parameters) -> Float[Array, "nv nq"]:

@@ -10,8 +10,8 @@ import numpy as np
 from .._programs import module_of
 from .._types import Coordinates
 from ._ends import Ends
+from ._force import pushes
 from ._frames import Numbers
-from ._functions import pushes
 from ._inerters import AbstractInerter
 from ._laws import (
     AbstractConstraintLaw,

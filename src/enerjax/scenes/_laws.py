@@ -285,9 +285,16 @@ class Deviation(AbstractLawOfMeasure):
 
 
 class AbstractForceLaw(AbstractLawOfMeasure):
-    """A force along a measure that has no potential; its power is `force * rate`."""
+    """A force along a measure that has no potential; its power is `force * rate`.
+
+    - `resists`: whether the force depends on this rate.
+    """
 
     measure: AbstractMeasure
+
+    @property
+    def resists(self) -> bool:
+        return True
 
     def __call__(self, a: Frame, b: Frame, numbers: Numbers) -> Any:
         return self.measure(a, b, numbers)
@@ -361,6 +368,10 @@ class Acting(AbstractForceLaw):
     measure: AbstractMeasure
     signal: Callable[..., Array]
     feedback: bool
+
+    @property
+    def resists(self) -> bool:
+        return self.feedback and not self.measure.is_vector
 
     def force(self, a: Frame, b: Frame, rate: Array, numbers: Numbers) -> Array:
         return numbers["value"]

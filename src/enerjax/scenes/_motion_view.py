@@ -32,12 +32,23 @@ class Moving(View):
       also of a body in the plane. In space an angle is zero in the start pose (for a joint
       with an `axis_b`, where its `frame_a` and `frame_b` agree), and jumps at half a turn.
     - `rate(name)`: of this angle or length. It does not jump.
+
+    With `added` all these angles or lengths, and their rates, are told with this much
+    added, so that the gains of a feedback are derivatives.
     """
 
-    def __init__(self, layout: Layout, q: Coordinates, v: Velocities, args: Parameters):
+    def __init__(
+        self,
+        layout: Layout,
+        q: Coordinates,
+        v: Velocities,
+        args: Parameters,
+        added: tuple[Scalar, Scalar] | None = None,
+    ):
         super().__init__(layout, q)
         self.v = v
         self._args = args
+        self._added = added
 
     def velocity(self, body: str, point: Vector | None = None) -> Point:
         """The velocity in space of a point of a body; its mass centre if none is given."""
@@ -64,7 +75,10 @@ class Moving(View):
         measure = measure_of(self.layout, name)
         group, numbers = link_of(self.layout, name, self._args)
         group = group._replace(law=measure)
-        return self.with_rate(lambda view: evaluate(group, view, numbers)[0])
+        value, rate = self.with_rate(lambda view: evaluate(group, view, numbers)[0])
+        if self._added is None:
+            return value, rate
+        return value + self._added[0], rate + self._added[1]
 
     def with_rate(self, value: Callable[[View], Array]) -> tuple[Array, Array]:
         """A quantity and its rate."""

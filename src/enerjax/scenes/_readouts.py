@@ -10,13 +10,14 @@ from .._analysis import ConsistentStart, Equilibrium
 from .._programs import compiled
 from .._system import State
 from .._types import Real, Scalar
-from ._functions import at_time, pushes
+from ._force import pushes
 from ._laws import AbstractForceLaw, AbstractSpringLaw, Driven, Flywheel, Length
 from ._layout import Layout
 from ._measures import AbstractTurn
 from ._motion_view import link_of, measure_of, Moving
 from ._parameters import Parameters
 from ._reactions import each
+from ._signals import at_time
 
 
 class Readout(NamedTuple):
