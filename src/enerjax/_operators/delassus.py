@@ -5,7 +5,8 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from .._solvers import Schur, Symmetric
 from .._system import Frames
@@ -38,8 +39,9 @@ class DelassusMatrix(eqx.Module):
     - `frames`: the map to the rates of redundant coordinates; `None` if there are none.
     - `regularisation`: the diagonal matrix `E` that has been added to `G` before it was
       factorised, where joints may be redundant; else `None`.
-    - `elastic`: the same as `schur` with the rows of strains behind those of the joints;
-      see `elastic.py`. `None` where stiffness is omitted.
+    - `elastic`: the same as `schur` with the rows of strains and dampers behind those of
+      the joints; see `elastic.py`. `None` where these are omitted.
+    - `num_strains`: the number of the rows of strains; those of dampers follow.
     """
 
     inverse_inertia: Symmetric
@@ -47,6 +49,7 @@ class DelassusMatrix(eqx.Module):
     frames: Frames | None
     regularisation: JointMultipliers | None = None
     elastic: Schur | None = None
+    num_strains: int = eqx.field(default=0, static=True)
 
     def product(self, velocity: Velocities) -> Multipliers:
         """`C velocity`, the rates of change of the joints."""
@@ -99,27 +102,36 @@ class DelassusMatrix(eqx.Module):
         (both,), (velocity,) = self._beside_strains(self.elastic, right[None], free[None])
         return both[: rates.size], velocity, tuple(found)
 
-    def softened(self, free: Float[Array, "k nv"]) -> Float[Array, "k nv"]:
-        """The velocities `u` to which strains reduce each of `k` velocities `free`:
+    def resisted(
+        self, free: Float[Array, "k nv"], rates: Float[Array, "k nc"]
+    ) -> Float[Array, "k nv"]:
+        """The velocities `u` to which strains and dampers reduce each of `k` velocities:
 
-        (M + S^T S) u + C^T x = M free,   C u = C free
+        (M + S^T S) u + C^T x = M free,   C u = rates
         """
         assert self.elastic is not None
-        strains = jax.vmap(self._strain_rates)(free)
-        _, velocities = self._beside_strains(self.elastic, strains, free)
-        return velocities
+        right = jax.vmap(self.elastic.product)(free).at[:, : rates.shape[1]].add(-rates)
+        return self._beside_strains(self.elastic, right, free)[1]
 
     def elastic_force(self, velocity: Velocities) -> Velocities:
         """`S^T S velocity`"""
         assert self.elastic is not None
-        return self.elastic.transposed(self._strain_rates(velocity))
+        return self.elastic.transposed(self.elastic_rates(velocity))
 
-    def _strain_rates(self, velocity: Velocities) -> Float[Array, " n"]:
+    def elastic_rates(self, velocity: Velocities) -> Float[Array, " n"]:
         """`S velocity`, behind zeros for the joints."""
         assert self.elastic is not None
         assert self.schur is not None
         num_joints = self.schur.tables.num_rows
         return self.elastic.product(velocity).at[:num_joints].set(0)
+
+    @property
+    def is_strain(self) -> Bool[np.ndarray, " n"]:
+        """Which rows of `S`, behind those of the joints, are those of strains."""
+        assert self.elastic is not None
+        assert self.schur is not None
+        rows = np.arange(self.elastic.tables.num_rows)
+        return rows < self.schur.tables.num_rows + self.num_strains
 
     def _beside_strains(
         self, elastic: Schur, right: Float[Array, "k n"], free: Float[Array, "k nv"]

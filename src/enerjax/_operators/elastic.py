@@ -15,7 +15,7 @@ taken as strains with the stiffness `2 c / h`.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -43,6 +43,8 @@ _LEAST_PIVOT = 1e-12
 # Programs for these take longer to compile than those with the exact Jacobian.
 _BOUNDS = Bounds(blocks=24, rows=64, rounds=16)
 
+# What the chord method includes beside the inertia and the joints, in this order.
+ChordTerms: TypeAlias = tuple[Literal["strains", "dampers"], ...]
 # A potential energy `V(q, args)`.
 Potential: TypeAlias = Callable[[Coordinates, Args], Scalar]
 # Rates of the joints, followed by the rows of the strains.
@@ -50,21 +52,23 @@ Rates: TypeAlias = Callable[[Velocities], Float[Array, " rows"]]
 
 
 class ElasticTables(NamedTuple):
-    """The index tables of the joints, and those of joints and strains together.
+    """The index tables of the joints, and those of joints, strains and dampers together.
 
     The colours of the columns are equal, so one set of products serves both.
 
-    - `has_dampers`: whether there are rows of dampers too.
+    - `terms`: which rows there are behind those of the joints.
+    - `num_strains`: the number of the rows of strains; those of dampers follow.
     """
 
     joints: SchurTables
     both: SchurTables
-    has_dampers: bool
+    terms: ChordTerms
+    num_strains: int
 
     @property
     def description(self) -> str:
         count = self.both.num_rows - self.joints.num_rows
-        what = "strains and dampers" if self.has_dampers else "strains"
+        what = " and ".join(self.terms)
         return f"{self.both.description}; {count} of the rows are those of {what}"
 
     def schurs(
@@ -87,14 +91,15 @@ class ElasticTables(NamedTuple):
 
 
 def elastic_tables(
-    rates: Rates, num_joints: int, rest: Velocities, weight: Symmetric, has_dampers: bool
-) -> ElasticTables | None:
-    """The tables for `rates`; `None` where the elimination is long, like that of a net."""
+    rates: Rates, num_joints: int, rest: Velocities, weight: Symmetric
+) -> tuple[SchurTables, SchurTables] | None:
+    """The tables of the joints, and of all `rates`; `None` where the elimination is long,
+    like that of a net."""
     both = schur_tables(rates, rest, weight, bounds=_BOUNDS)
     if both is None:
         return None
     joints = schur_tables(lambda v: rates(v)[:num_joints], rest, weight, both.colours)
-    return None if joints is None else ElasticTables(joints, both, has_dampers)
+    return None if joints is None else (joints, both)
 
 
 class Elasticity(NamedTuple):

@@ -39,7 +39,6 @@ from .._solvers import (
     Symmetric,
 )
 from .._system import (
-    AbstractDampedForce,
     AbstractKinematics,
     ByRates,
     Frames,
@@ -61,6 +60,7 @@ from .action import action_of, gradient_in_rows
 from .base import AbstractModel, Position, Reaction
 from .delassus import DelassusMatrix
 from .elastic import (
+    ChordTerms,
     elastic_rates,
     elastic_tables,
     Elasticity,
@@ -95,7 +95,7 @@ class SeparableModel(AbstractModel):
     kinematics: AbstractKinematics
     # The index tables of `delassus_matrix`; `None` where there is none.
     constraint_tables: SchurTables | None = eqx.field(static=True)
-    # The same with the rows of strains; `None` where the chord method omits stiffness.
+    # The same with the rows of strains and dampers; `None` where the chord method has none.
     elastic_tables: ElasticTables | None = eqx.field(static=True)
     # The model with the velocities of the user, if those of this one are others.
     without_rotations: "SeparableModel | None"
@@ -107,7 +107,7 @@ class SeparableModel(AbstractModel):
         args: Args,
         *,
         rotates_in: tuple[int, ...] = (),
-        elastic: bool = False,
+        chord_terms: tuple[ChordTerms, ...] = (),
     ):
         self.system = system
         self.args = args
@@ -125,12 +125,10 @@ class SeparableModel(AbstractModel):
         self.inverse_inertia = inverse_of(self.inertia)
         self.scales = self._scales(state)
         self.constraint_tables = self._constraint_tables(state)
-        # Without dampers if with them the elimination would be long.
         self.elastic_tables = None
-        if elastic and isinstance(system.force, AbstractDampedForce):
-            self.elastic_tables = self._elastic_tables(state, has_dampers=True)
-        if elastic and self.elastic_tables is None:
-            self.elastic_tables = self._elastic_tables(state, has_dampers=False)
+        for terms in chord_terms:
+            if self.elastic_tables is None:
+                self.elastic_tables = self._elastic_tables(state, terms)
 
     @property
     def has_own_momenta(self) -> bool:
@@ -465,7 +463,10 @@ class SeparableModel(AbstractModel):
         if h is not None and self.elastic_tables is not None:
             rates = self._rates_with_strains(state, h)
             both = self.elastic_tables.schurs(rates, rest, weight, added)
-            return DelassusMatrix(self.inverse_inertia, both[0], None, added, both[1])
+            tables = self.elastic_tables
+            return DelassusMatrix(
+                self.inverse_inertia, both[0], None, added, both[1], tables.num_strains
+            )
         frames = self._frames(q)
         products = tables.products(self._rates_of_joints(q, state.t, frames), rest)
         rows = schur(tables, products, weight, added)
@@ -483,41 +484,47 @@ class SeparableModel(AbstractModel):
         self, state: State, h: Scalar
     ) -> Callable[[Velocities], Float[Array, " rows"]]:
         """The rows of the strains, and of the dampers if the chord method has them."""
-        tables = self.elastic_tables
-        strains = self._strains(state, h, tables is not None and tables.has_dampers)
+        terms = () if self.elastic_tables is None else self.elastic_tables.terms
+        strains = self._strains(state, h, terms)
         return elastic_rates(strains, state.q, h, lambda v: self.lift(state.q, v))
 
-    def _strains(self, state: State, h: Scalar, with_dampers: bool) -> Elasticity:
-        strains = elasticity(self.system.potential, state.q, self.args)
-        if not with_dampers:
-            return strains
-        user = self.to_rates(state)
-        return strains.with_others(resistance(self.system, user, self.args, h))
+    def _strains(self, state: State, h: Scalar, terms: ChordTerms) -> Elasticity:
+        found = Elasticity(lambda q: [], [])
+        if "strains" in terms:
+            found = elasticity(self.system.potential, state.q, self.args)
+        if "dampers" in terms:
+            user = self.to_rates(state)
+            found = found.with_others(resistance(self.system, user, self.args, h))
+        return found
 
-    def _elastic_tables(self, state: State, has_dampers: bool) -> ElasticTables | None:
-        """The tables of joints and strains together, and of dampers if `has_dampers`.
+    def _elastic_tables(self, state: State, terms: ChordTerms) -> ElasticTables | None:
+        """The tables of joints and of the rows of these terms together.
 
-        `None` where there are none, where coordinates are redundant, where there are more
-        of them than velocities, and where the elimination would be long: the exact Jacobian
-        is better then.
+        `None` where one of the terms has no rows, where coordinates are redundant, where
+        there are more rows than velocities, and where the elimination would be long: the
+        exact Jacobian is better then.
         """
         q, rest = state.q, jnp.zeros_like(self.inertia.diagonal())
         if self.constraint_tables is None or self._frames(q) is not None:
             return None
         t = jnp.zeros((), rest.dtype) if self.system.is_timed else None
         still, unit = State(q, rest, t), jnp.ones((), rest.dtype)
-        strains = self._strains(still, unit, has_dampers)
-        if not 0 < strains.num_strains <= rest.size:
+        counts = [self._strains(still, unit, (term,)).num_strains for term in terms]
+        if min(counts) == 0 or sum(counts) > rest.size:
             return None
         joints = self._rates_of_joints(q, t, None)
+        strains = self._strains(still, unit, terms)
         rows = elastic_rates(strains, q, unit, lambda v: self.lift(q, v))
-        return elastic_tables(
+        tables = elastic_tables(
             lambda v: jnp.concatenate([joints(v), rows(v)]),
             self.constraint_tables.num_rows,
             rest,
             self.inverse_inertia,
-            has_dampers,
         )
+        if tables is None:
+            return None
+        num_strains = dict(zip(terms, counts, strict=True)).get("strains", 0)
+        return ElasticTables(*tables, terms, num_strains)
 
     def _frames(self, q: Coordinates) -> Frames | None:
         """`L` stacked on `B_c`, where coordinates are redundant."""

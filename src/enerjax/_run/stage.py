@@ -17,11 +17,11 @@ from jaxtyping import Array, PyTree
 
 from .._operators import (
     AbstractModel,
-    has_strains,
     Increment,
     roughness,
     scales_like,
     shortened,
+    terms_of_chord,
 )
 from .._programs import part, simplified
 from .._results import first_failure, from_root_finder, RESULTS
@@ -310,7 +310,7 @@ def _chord(scheme: AbstractOneSolveScheme, model: AbstractModel) -> Chord:
         z = _with_multipliers(jax.tree.map(jnp.multiply, x, scales.unknown), new)
         return jax.tree.map(jnp.multiply, z, scales.per_unknown)
 
-    return Chord(prepare, correct, effective, has_strains(model))
+    return Chord(prepare, correct, effective, bool(terms_of_chord(model)))
 
 
 def num_unknowns(memory: Memory) -> int:

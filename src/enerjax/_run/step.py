@@ -75,12 +75,12 @@ def model_for(
     scheme: AbstractScheme, system: AbstractSystem, state: State, args: Args
 ) -> AbstractModel:
     """The model of a system for a scheme, which may move rigid bodies by rotations, and may
-    include the stiffness of strains in its chord method."""
+    include stiffness and damping in its chord method."""
     stage = scheme.stage
     has_rotations = isinstance(stage, AbstractSchemeWithRotations)
     rotates_in = stage.rotates_in if has_rotations else ()
-    elastic = isinstance(stage, AbstractSchemeWithChord) and stage.has_elastic_chord
-    return make_model(system, state, args, rotates_in=rotates_in, elastic=elastic)
+    terms = stage.chord_terms if isinstance(stage, AbstractSchemeWithChord) else ()
+    return make_model(system, state, args, rotates_in=rotates_in, chord_terms=terms)
 
 
 def first_warm(

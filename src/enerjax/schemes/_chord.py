@@ -1,13 +1,15 @@
 """The corrections of the chord method, in closed form.
 
-The approximate Jacobian contains the inertia and the constraint gradients `C`, and in
-`step_chord` the stiffness `K` of strains; all other terms of the stiffness are omitted. The
-right-hand sides are the rows of the balance of momentum `r_m`, the constraints divided by
+The approximate Jacobian contains the inertia and the constraint gradients `C`, and where
+the Delassus matrix has them the stiffness `K` of strains and the resistance `c` of dampers.
+All other terms are omitted. The right-hand sides are the rows of the balance of momentum `r_m`, the constraints divided by
 `h`, `r_phi`, and their rates `r_psi`. After block elimination each kind of multiplier has a
 linear system with the matrix `G = C M^-1 C^T`.
 Coordinate constraints are taken out first, and their multipliers follow from the normal
 components of the balance of momentum. Where momenta are unknowns, they are taken out too.
 """
+
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -22,7 +24,7 @@ from ._discontinuous import JumpAndEnd
 def step_chord(rows: Increment, delassus: DelassusMatrix) -> Increment:
     """The correction of a step with `v1 = 2 (rate - M^-1 C^T eta) - v0`; it solves
 
-    2 (M + h^2/4 K) rate + C^T (impulse - 2 eta) = r_m
+    2 (M + h^2/4 K + h/2 c) rate + C^T (impulse - 2 eta) = r_m
     C rate = r_phi,   2 C rate - 2 G eta = r_psi
     """
     if rows.momentum.size > 0:
@@ -94,7 +96,7 @@ def jump_chord(alpha: Scalar, rows: JumpAndEnd, delassus: DelassusMatrix) -> Jum
         (1 + alpha) vj = 2 rate_1 + 6 rate_j - 2 M^-1 C^T eta_j
 
     It solves `M v1 + C^T impulse_1 = r_1` and `M vj - C^T (impulse_1 - impulse_j)/3 = r_j`,
-    and the rows of the constraints at both nodes; with strains see below.
+    and the rows of the constraints at both nodes; with strains and dampers see below.
     """
     if rows.end.momentum.size > 0:
         shifted = JumpAndEnd(
@@ -131,7 +133,7 @@ def jump_chord(alpha: Scalar, rows: JumpAndEnd, delassus: DelassusMatrix) -> Jum
     if is_ggl:
         slips = delassus.velocity(eta_1), delassus.velocity(eta_j)
     if delassus.elastic is not None:
-        v1, vj, change = _with_strains(alpha, (v1, vj), slips, delassus)
+        v1, vj, change = _with_resistance(alpha, (v1, vj), slips, delassus)
         after, before = after + change[0], before + change[1]
     rate = 0.5 * (v1 + vj) + slips[0]
     jump_rate = (1 + alpha) * vj + 2 * slips[1]
@@ -153,92 +155,117 @@ def jump_chord(alpha: Scalar, rows: JumpAndEnd, delassus: DelassusMatrix) -> Jum
     )
 
 
-# With the stiffness of strains the balances of momentum of the end and of the jump (rows
-# of `A`) also contain `h^2 K A (v1, vj)`, where
+# With the stiffness `K` of strains and the resistance `c` of dampers the balances of
+# momentum of the end and of the jump (rows of `A` and `R`) also contain
+# `(h^2 K A + h c R)(v1, vj)`,
 #
 #     A = [[1/6, 1/4 + alpha/12], [-(1/12 + alpha/36), -1/12 + alpha^2/36]]
+#     R = [[1/2, 1/2], [-1/6, alpha/6]],   det A = g^2,   det R = g,   g = (1 + alpha)/12
 #
-# Let `T` be `h^2 M^-1 K`, restricted to motions that the joints permit. The velocities are
-# those without stiffness times
+# The rows of `S` are scaled such that `S^T S = g h^2 K + sqrt(g) h c`. With `N = A/g` for
+# rows of strains and `N = R/sqrt(g)` for those of dampers, `det N = 1`, the terms are
+# `S^T N S`, and among the motions that the joints permit
 #
-#     (I + T A)^-1 = (I + T adj A) / (1 + tr A T + det A T^2)
+#     (M + S^T N S)^-1  ~  P = (M + S^T S)^-1 (M + S^T adj(N) S) (M + S^T S)^-1
 #
-# The roots of this denominator are complex. The chord method has `D = (1 + g T)^2` in its
-# place, with `g = (1 + alpha)/12`, the root of `det A`. It is exact for motions without
-# stiffness and in the limit of high frequencies. In between the part
+# This is exact for motions without stiffness and resistance, and in the limit of high
+# frequencies. In between, for one mass with `x = S^T S / M`, the part
 #
-#     E = (2 g - tr A) T / D,   at most (g - tr A / 2)/(2 g) <= 1/3,
+#     E = (2 - tr N) x / (1 + x)^2,   at most (2 - tr N)/4 <= 1/3,
 #
-# of `D` is too much, so the exact inverse is `(1 + E + E^2 + ...) / D`.
+# is too much, so the exact inverse is `(1 + E + E^2 + ...) P`.
 
 # The number of terms of this sum. A correction leaves at most (1/3)^3 of the error.
 _TERMS = 3
 
+# Vectors of velocities at the end of a step and after its jump.
+_Nodes: TypeAlias = Float[Array, "2 nv"]
+
 
 def elastic_length(alpha: Scalar, h: Scalar) -> Scalar:
-    """The length of time whose square is `4 g h^2`."""
+    """The length of time `l` with `g h^2 = l^2/4` and `sqrt(g) h = l/2`."""
     return h * jnp.sqrt((1 + alpha.astype(h.dtype)) / 3)
 
 
-def _divided(
-    alpha: Scalar, free: Float[Array, "k nv"], delassus: DelassusMatrix
-) -> tuple[Float[Array, "k nv"], Float[Array, "k nv"]]:
-    """`k` velocities divided by `1 + tr A T + det A T^2`, and `T` times these."""
-    share, trace = (1 + alpha) / 12, (3 + alpha**2) / 36
+def _resisted(alpha: Scalar, rates: _Nodes, delassus: DelassusMatrix) -> _Nodes:
+    """The velocities that strains and dampers take at both nodes, for the rates of the
+    increments to the end and to the jump."""
+    share = (1 + alpha) / 12
+    end, jump = jax.vmap(delassus.elastic_rates)(rates)
+    of_strains = jnp.stack([0.5 * (end + jump), (alpha * jump - end) / 6]) / share
+    of_dampers = jnp.stack([end, jump]) / jnp.sqrt(share)
+    return _pulled(jnp.where(delassus.is_strain, of_strains, of_dampers), delassus)
+
+
+def _by_adjoint(alpha: Scalar, velocities: _Nodes, delassus: DelassusMatrix) -> _Nodes:
+    """`M^-1 S^T adj(N) S velocities`"""
+    share = (1 + alpha) / 12
+    end, jump = jax.vmap(delassus.elastic_rates)(velocities)
+    of_strains = [
+        (alpha**2 - 3) / 36 * end - (3 + alpha) / 12 * jump,
+        (3 + alpha) / 36 * end + jump / 6,
+    ]
+    of_dampers = [alpha / 6 * end - 0.5 * jump, end / 6 + 0.5 * jump]
+    both = jnp.stack(of_strains) / share, jnp.stack(of_dampers) / jnp.sqrt(share)
+    return _pulled(jnp.where(delassus.is_strain, *both), delassus)
+
+
+def _pulled(rows: Float[Array, "2 n"], delassus: DelassusMatrix) -> _Nodes:
+    """`M^-1 S^T rows`"""
+    assert delassus.elastic is not None
+    forces = jax.vmap(delassus.elastic.transposed)(rows)
+    return jax.vmap(delassus.inverse_inertia.__matmul__)(forces)
+
+
+def _rates_of_nodes(alpha: Scalar, velocities: _Nodes) -> _Nodes:
+    """The rates of the increments to the end and to the jump, without multipliers."""
+    v1, vj = velocities
+    return jnp.stack([0.5 * (v1 + vj), (alpha * vj - v1) / 6])
+
+
+def velocities_of_nodes(
+    alpha: Scalar, free: _Nodes, delassus: DelassusMatrix, by_slip: _Nodes | None = None
+) -> _Nodes:
+    """The velocities at both nodes with strains and dampers.
+
+    `free` are those without; their rates of the joints are kept. `by_slip` is what other
+    motions have taken from them.
+    """
 
     def add(_: int, sums: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        rest, total, by_stiffness = sums
-        once = delassus.softened(rest)
-        twice = delassus.softened(once)
-        # T / D
-        moved = (once - twice) / share
-        return (2 * share - trace) * moved, total + twice, by_stiffness + moved
+        rest, joints, total = sums
+        once = delassus.resisted(rest, joints)
+        turned = once + _by_adjoint(alpha, once, delassus)
+        found = delassus.resisted(turned, joints)
+        taken = _resisted(alpha, _rates_of_nodes(alpha, found), delassus)
+        # What is left moves no joint.
+        return rest - found - taken, jnp.zeros_like(joints), total + found
 
-    none = jnp.zeros_like(free)
-    _, total, by_stiffness = jax.lax.fori_loop(0, _TERMS, add, (free, none, none))
-    return total, by_stiffness
-
-
-def velocities_with_strains(
-    alpha: Scalar, v1: Velocities, vj: Velocities, delassus: DelassusMatrix
-) -> tuple[Velocities, Velocities]:
-    """The velocities with stiffness, from those without."""
-    divided = _divided(alpha, jnp.stack([v1, vj]), delassus)
-    (at_end, at_jump), (by_end, by_jump) = divided
-    v1 = at_end + (alpha**2 - 3) / 36 * by_end - (3 + alpha) / 12 * by_jump
-    return v1, at_jump + (3 + alpha) / 36 * by_end + by_jump / 6
+    joints = jax.vmap(delassus.product)(free)
+    rest = free if by_slip is None else free - by_slip
+    first = rest, joints, jnp.zeros_like(free)
+    return jax.lax.fori_loop(0, _TERMS, add, first)[2]
 
 
-def _with_strains(
+def _with_resistance(
     alpha: Scalar,
     free: tuple[Velocities, Velocities],
     slips: tuple[Velocities, Velocities],
     delassus: DelassusMatrix,
 ) -> tuple[Velocities, Velocities, Float[Array, "2 nc"]]:
-    """The velocities `v1` and `vj` with stiffness, and the change of the multipliers of the
-    joints by the forces of strains.
+    """The velocities `v1` and `vj` with strains and dampers, and the change of the
+    multipliers of the joints by their forces.
 
-    `free` are the velocities without stiffness, and `slips` those by which rates differ
-    from them, `M^-1 C^T eta_1` and `M^-1 C^T eta_j`.
+    `free` are the velocities without, and `slips` those by which rates differ from them,
+    `M^-1 C^T eta_1` and `M^-1 C^T eta_j`.
     """
-
-    def slowed(rate: Velocities, jump_rate: Velocities) -> tuple[Velocities, Velocities]:
-        """What the strains of these rates take from the velocities of both nodes."""
-        stiff = lambda x: 12 / (1 + alpha) * delassus.elastic_force(x)
-        end, jump = (delassus.inverse_inertia @ stiff(x) for x in (rate, jump_rate))
-        return 0.5 * (end + jump), (alpha * jump - end) / 6
-
-    of_slips = slips[0], (slips[1] - slips[0]) / 3
-    by_slip = slowed(*of_slips)
-    held = delassus.solve(jnp.stack([delassus.product(x) for x in by_slip]))
-    v1, vj = (
-        x - by + delassus.velocity(impulse)
-        for x, by, impulse in zip(free, by_slip, held, strict=True)
-    )
-    v1, vj = velocities_with_strains(alpha, v1, vj, delassus)
-    end, jump = slowed(0.5 * (v1 + vj) + of_slips[0], (alpha * vj - v1) / 6 + of_slips[1])
-    right = jnp.stack([-delassus.product(end), 3 * delassus.product(jump)])
-    return v1, vj, delassus.solve(right)
+    of_slips = jnp.stack([slips[0], (slips[1] - slips[0]) / 3])
+    by_slip = _resisted(alpha, of_slips, delassus)
+    found = velocities_of_nodes(alpha, jnp.stack(free), delassus, by_slip)
+    rates = _rates_of_nodes(alpha, found) + of_slips
+    end, jump = jax.vmap(delassus.product)(_resisted(alpha, rates, delassus))
+    v1, vj = found
+    return v1, vj, delassus.solve(jnp.stack([-end, 3 * jump]))
 
 
 def skew_chord(rows: Increment, delassus: DelassusMatrix) -> Increment:
@@ -248,9 +275,10 @@ def skew_chord(rows: Increment, delassus: DelassusMatrix) -> Increment:
         M v1 + C^T impulse + h^2 K (rate / 2 - v1 / 12) = r_m
         C rate = r_phi,   C v1 = r_psi
 
-    Its denominator is that of the nodes above for `alpha = 0`.
+    Its denominator `1 + tr A h^2 K + det A (h^2 K)^2` is that of the nodes above for
+    `alpha = 0`.
     """
-    if delassus.elastic is None or rows.momentum.size > 0:
+    if delassus.num_strains == 0 or rows.momentum.size > 0:
         return step_chord(rows, delassus)
     inverse, slip = delassus.inverse_inertia, rows.velocity_impulse
     stiff = lambda velocity: 12 * delassus.elastic_force(velocity)
@@ -259,7 +287,9 @@ def skew_chord(rows: Increment, delassus: DelassusMatrix) -> Increment:
     (held,) = delassus.solve((delassus.product(free) - rows.impulse)[None])
     none = jnp.zeros((), free.dtype)
     without = free - delassus.velocity(held)
-    rate = _divided(none, without[None], delassus)[0][0]
+    nodes = jnp.stack([without, jnp.zeros_like(without)])
+    # The sum of both velocities is `without`, divided by the denominator.
+    rate = jnp.sum(velocities_of_nodes(none, nodes, delassus), axis=0)
     moved = inverse @ (stiff(rate) / 12)
     (eta,) = delassus.solve((rows.impulse - 0.5 * slip - delassus.product(moved))[None])
     v1 = 2 * (rate - moved - delassus.velocity(eta))

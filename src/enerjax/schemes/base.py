@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, PyTree
 from .._discrete import AbstractDerivative, ChainRule
 from .._operators import (
     AbstractModel,
+    ChordTerms,
     DelassusMatrix,
     Gradient,
     Increment,
@@ -420,7 +421,7 @@ class AbstractSchemeWithChord(AbstractOneSolveScheme[Z, P], Generic[Z, P]):
     """A scheme with an approximate Jacobian for the chord method.
 
     The approximate Jacobian contains the inertia and the gradients of the constraints, and
-    if `has_elastic_chord` the stiffness of strains. It differs from the exact one by terms
+    those of `chord_terms` that the system has. It differs from the exact one by terms
     of relative size `h^2` times the other stiffness divided by inertia. Where these are
     small, the chord method with this matrix converges quickly, and its linear systems have
     the Delassus matrix `B M^-1 B^T`. Where it fails, the exact Jacobian is used.
@@ -428,9 +429,14 @@ class AbstractSchemeWithChord(AbstractOneSolveScheme[Z, P], Generic[Z, P]):
 
     @property
     @abc.abstractmethod
-    def has_elastic_chord(self) -> bool:
-        """Whether the approximate Jacobian also contains the stiffness of strains, so that
-        stiff springs and beams do not slow its convergence."""
+    def chord_terms(self) -> tuple[ChordTerms, ...]:
+        """The terms that the approximate Jacobian also contains, so that they do not slow
+        its convergence: `("strains",)` for the stiffness of springs and beams,
+        `("dampers",)` for the resistance of dampers, or both.
+
+        Of several choices the first one is taken that the system has, and for which the
+        elimination is short; without any it contains none.
+        """
 
     @abc.abstractmethod
     def delassus_matrix(self, z: Z, problem: P) -> DelassusMatrix:

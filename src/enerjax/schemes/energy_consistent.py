@@ -5,7 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._discrete import AbstractDerivative, MeanValue
-from .._operators import AbstractModel, DelassusMatrix, Gradient, Increment, Reaction
+from .._operators import (
+    AbstractModel,
+    ChordTerms,
+    DelassusMatrix,
+    Gradient,
+    Increment,
+    Reaction,
+    terms_of_chord,
+)
 from .._programs import is_known
 from .._solvers import Assembled
 from .._system import State
@@ -118,9 +126,9 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
         return 4 if self.symmetric else 3
 
     @property
-    def has_elastic_chord(self) -> bool:
+    def chord_terms(self) -> tuple[ChordTerms, ...]:
         # The damping of stiffness has a matrix of its own.
-        return isinstance(self.alpha, float)
+        return (("strains",), ("dampers",)) if isinstance(self.alpha, float) else ()
 
     def problem(self, model: AbstractModel, start: State, h: Scalar) -> _Problem:
         refuse_nonholonomic(
@@ -166,9 +174,11 @@ class EnergyConsistent(AbstractSchemeWithChord[_Unknowns, _Problem]):
         return JumpAndEnd(jump_rows, self._rows(z.end, problem, end, jump))
 
     def delassus_matrix(self, z: _Unknowns, problem: _Problem) -> DelassusMatrix:
-        elastic = None
+        elastic, h = None, problem.step.h
         if problem.dissipative is None:
-            elastic = elastic_length(jnp.zeros_like(problem.step.h), problem.step.h)
+            elastic = elastic_length(jnp.zeros_like(h), h)
+            if terms_of_chord(problem.step.model) == ("dampers",):
+                elastic = h
         return problem.step.delassus_matrix(_end_of(z), elastic)
 
     def chord(

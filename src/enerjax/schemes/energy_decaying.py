@@ -3,7 +3,7 @@ from typing import ClassVar
 import equinox as eqx
 
 from .._discrete import AbstractDerivative, ChainRule
-from .._operators import AbstractModel, DelassusMatrix, Reaction
+from .._operators import AbstractModel, ChordTerms, DelassusMatrix, Reaction
 from .._system import State
 from .._types import Multipliers, Real, Scalar, Velocities
 from ._arguments import (
@@ -96,8 +96,8 @@ class EnergyDecaying(AbstractSchemeWithRotations[JumpAndEnd, StepProblem]):
         return False
 
     @property
-    def has_elastic_chord(self) -> bool:
-        return True
+    def chord_terms(self) -> tuple[ChordTerms, ...]:
+        return ("strains", "dampers"), ("strains",), ("dampers",)
 
     def problem(self, model: AbstractModel, start: State, h: Scalar) -> StepProblem:
         return StepProblem(model, start, h, self.derivative, self.formulation)

@@ -4,12 +4,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._operators import AbstractModel, DelassusMatrix, Increment, Reaction, Strains
+from .._operators import (
+    AbstractModel,
+    ChordTerms,
+    DelassusMatrix,
+    Increment,
+    Reaction,
+    Strains,
+)
 from .._programs import is_known
 from .._system import State
 from .._types import JointMultipliers, Multipliers, Real, Scalar, Velocities
 from ._arguments import alpha_from_spectral_radius, as_alpha
-from ._chord import elastic_length, step_chord, velocities_with_strains
+from ._chord import elastic_length, step_chord, velocities_of_nodes
 from .base import AbstractSchemeWithRotations, Formulation, StepEnd, StepProblem
 
 
@@ -135,8 +142,8 @@ class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
         return 2
 
     @property
-    def has_elastic_chord(self) -> bool:
-        return True
+    def chord_terms(self) -> tuple[ChordTerms, ...]:
+        return (("strains",),)
 
     def problem(self, model: AbstractModel, start: State, h: Scalar) -> _Problem:
         if model.has_own_momenta or not model.in_rates.has_canonical_rates:
@@ -246,12 +253,8 @@ class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
         free = inverse @ (end.rate - force)
         right = (delassus.product(pushed), delassus.product(free) - slip)
         at_jump, at_end = delassus.solve(jnp.stack(right))
-        v1, jump = velocities_with_strains(
-            alpha,
-            free - delassus.velocity(at_end),
-            pushed - delassus.velocity(at_jump),
-            delassus,
-        )
+        nodes = free - delassus.velocity(at_end), pushed - delassus.velocity(at_jump)
+        v1, jump = velocities_of_nodes(alpha, jnp.stack(nodes), delassus)
         change = held[0] + h / 2 * rates(v1 + jump)
         strain = held[1] - h / 6 * rates(v1 - alpha * jump)
         impulse, force = impulse_and_force(change, strain)

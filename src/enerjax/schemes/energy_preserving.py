@@ -2,7 +2,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._discrete import AbstractDerivative, ChainRule
-from .._operators import AbstractModel, DelassusMatrix, Increment, Reaction
+from .._operators import AbstractModel, ChordTerms, DelassusMatrix, Increment, Reaction
 from .._system import State
 from .._types import Multipliers, Scalar, Velocities
 from ._arguments import check_derivative, check_formulation
@@ -57,8 +57,8 @@ class EnergyPreserving(AbstractSchemeWithRotations[Increment, StepProblem]):
         return True
 
     @property
-    def has_elastic_chord(self) -> bool:
-        return True
+    def chord_terms(self) -> tuple[ChordTerms, ...]:
+        return ("strains", "dampers"), ("strains",), ("dampers",)
 
     def problem(self, model: AbstractModel, start: State, h: Scalar) -> StepProblem:
         return StepProblem(

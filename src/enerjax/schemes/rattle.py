@@ -1,6 +1,6 @@
 import equinox as eqx
 
-from .._operators import AbstractModel, DelassusMatrix, Increment
+from .._operators import AbstractModel, ChordTerms, DelassusMatrix, Increment
 from .._system import State
 from .._types import Coordinates, Multipliers, Scalar, Velocities
 from ._chord import rattle_chord
@@ -63,8 +63,8 @@ class Rattle(AbstractSchemeWithChord[Increment, StepProblem]):
         return problem.rows_of_balance(z, balance, self._end(z, problem))
 
     @property
-    def has_elastic_chord(self) -> bool:
-        return False
+    def chord_terms(self) -> tuple[ChordTerms, ...]:
+        return ()
 
     def delassus_matrix(self, z: Increment, problem: StepProblem) -> DelassusMatrix:
         return problem.delassus_matrix(z)
