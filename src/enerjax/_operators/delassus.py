@@ -104,14 +104,23 @@ class DelassusMatrix(eqx.Module):
 
     def resisted(
         self, free: Float[Array, "k nv"], rates: Float[Array, "k nc"]
-    ) -> Float[Array, "k nv"]:
+    ) -> tuple[Float[Array, "k nv"], Float[Array, "k n"]]:
         """The velocities `u` to which strains and dampers reduce each of `k` velocities:
 
-        (M + S^T S) u + C^T x = M free,   C u = rates
+            (M + S^T S) u + C^T x = M free,   C u = rates
+
+        and `S u`, behind zeros for the joints.
         """
         assert self.elastic is not None
         right = jax.vmap(self.elastic.product)(free).at[:, : rates.shape[1]].add(-rates)
-        return self._beside_strains(self.elastic, right, free)[1]
+        both, velocities = self._beside_strains(self.elastic, right, free)
+        return velocities, both.at[:, : rates.shape[1]].set(0)
+
+    def pulled(self, rows: Float[Array, "k n"]) -> Float[Array, "k nv"]:
+        """`M^-1 S^T rows`, with zeros for the joints in front of each row."""
+        assert self.elastic is not None
+        forces = jax.vmap(self.elastic.transposed)(rows)
+        return jax.vmap(self.inverse_inertia.__matmul__)(forces)
 
     def elastic_force(self, velocity: Velocities) -> Velocities:
         """`S^T S velocity`"""

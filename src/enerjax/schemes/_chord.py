@@ -2,9 +2,9 @@
 
 The approximate Jacobian contains the inertia and the constraint gradients `C`, and where
 the Delassus matrix has them the stiffness `K` of strains and the resistance `c` of dampers.
-All other terms are omitted. The right-hand sides are the rows of the balance of momentum `r_m`, the constraints divided by
-`h`, `r_phi`, and their rates `r_psi`. After block elimination each kind of multiplier has a
-linear system with the matrix `G = C M^-1 C^T`.
+All other terms are omitted. The right-hand sides are the rows of the balance of momentum
+`r_m`, the constraints divided by `h`, `r_phi`, and their rates `r_psi`. After block
+elimination each kind of multiplier has a linear system with the matrix `G = C M^-1 C^T`.
 Coordinate constraints are taken out first, and their multipliers follow from the normal
 components of the balance of momentum. Where momenta are unknowns, they are taken out too.
 """
@@ -178,8 +178,10 @@ def jump_chord(alpha: Scalar, rows: JumpAndEnd, delassus: DelassusMatrix) -> Jum
 # The number of terms of this sum. A correction leaves at most (1/3)^3 of the error.
 _TERMS = 3
 
-# Vectors of velocities at the end of a step and after its jump.
+# Velocities at the end of a step and after its jump, and products of `S` with such vectors,
+# behind zeros for the joints.
 _Nodes: TypeAlias = Float[Array, "2 nv"]
+_Rows: TypeAlias = Float[Array, "2 rows"]
 
 
 def elastic_length(alpha: Scalar, h: Scalar) -> Scalar:
@@ -187,37 +189,30 @@ def elastic_length(alpha: Scalar, h: Scalar) -> Scalar:
     return h * jnp.sqrt((1 + alpha.astype(h.dtype)) / 3)
 
 
-def _resisted(alpha: Scalar, rates: _Nodes, delassus: DelassusMatrix) -> _Nodes:
-    """The velocities that strains and dampers take at both nodes, for the rates of the
-    increments to the end and to the jump."""
-    share = (1 + alpha) / 12
-    end, jump = jax.vmap(delassus.elastic_rates)(rates)
+def _resisted(alpha: Scalar, rates: _Rows, delassus: DelassusMatrix) -> _Nodes:
+    """The velocities that strains and dampers take at both nodes.
+
+    `rates` are `S` times the rates of the increments to the end and to the jump.
+    """
+    share, (end, jump) = (1 + alpha) / 12, rates
     of_strains = jnp.stack([0.5 * (end + jump), (alpha * jump - end) / 6]) / share
-    of_dampers = jnp.stack([end, jump]) / jnp.sqrt(share)
-    return _pulled(jnp.where(delassus.is_strain, of_strains, of_dampers), delassus)
+    of_dampers = rates / jnp.sqrt(share)
+    return delassus.pulled(jnp.where(delassus.is_strain, of_strains, of_dampers))
 
 
-def _by_adjoint(alpha: Scalar, velocities: _Nodes, delassus: DelassusMatrix) -> _Nodes:
-    """`M^-1 S^T adj(N) S velocities`"""
-    share = (1 + alpha) / 12
-    end, jump = jax.vmap(delassus.elastic_rates)(velocities)
+def _by_adjoint(alpha: Scalar, rows: _Rows, delassus: DelassusMatrix) -> _Nodes:
+    """`M^-1 S^T adj(N) rows`"""
+    share, (end, jump) = (1 + alpha) / 12, rows
     of_strains = [
         (alpha**2 - 3) / 36 * end - (3 + alpha) / 12 * jump,
         (3 + alpha) / 36 * end + jump / 6,
     ]
     of_dampers = [alpha / 6 * end - 0.5 * jump, end / 6 + 0.5 * jump]
     both = jnp.stack(of_strains) / share, jnp.stack(of_dampers) / jnp.sqrt(share)
-    return _pulled(jnp.where(delassus.is_strain, *both), delassus)
+    return delassus.pulled(jnp.where(delassus.is_strain, *both))
 
 
-def _pulled(rows: Float[Array, "2 n"], delassus: DelassusMatrix) -> _Nodes:
-    """`M^-1 S^T rows`"""
-    assert delassus.elastic is not None
-    forces = jax.vmap(delassus.elastic.transposed)(rows)
-    return jax.vmap(delassus.inverse_inertia.__matmul__)(forces)
-
-
-def _rates_of_nodes(alpha: Scalar, velocities: _Nodes) -> _Nodes:
+def _rates_of_nodes(alpha: Scalar, velocities: Float[Array, "2 n"]) -> Float[Array, "2 n"]:
     """The rates of the increments to the end and to the jump, without multipliers."""
     v1, vj = velocities
     return jnp.stack([0.5 * (v1 + vj), (alpha * vj - v1) / 6])
@@ -225,26 +220,29 @@ def _rates_of_nodes(alpha: Scalar, velocities: _Nodes) -> _Nodes:
 
 def velocities_of_nodes(
     alpha: Scalar, free: _Nodes, delassus: DelassusMatrix, by_slip: _Nodes | None = None
-) -> _Nodes:
-    """The velocities at both nodes with strains and dampers.
+) -> tuple[_Nodes, _Rows]:
+    """The velocities at both nodes with strains and dampers, and `S` times these.
 
     `free` are those without; their rates of the joints are kept. `by_slip` is what other
     motions have taken from them.
     """
 
-    def add(_: int, sums: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        rest, joints, total = sums
-        once = delassus.resisted(rest, joints)
-        turned = once + _by_adjoint(alpha, once, delassus)
-        found = delassus.resisted(turned, joints)
-        taken = _resisted(alpha, _rates_of_nodes(alpha, found), delassus)
+    def add(_: int, sums: tuple[Array, ...]) -> tuple[Array, ...]:
+        rest, joints, total, rows = sums
+        once, by_once = delassus.resisted(rest, joints)
+        turned = once + _by_adjoint(alpha, by_once, delassus)
+        found, by_found = delassus.resisted(turned, joints)
+        taken = _resisted(alpha, _rates_of_nodes(alpha, by_found), delassus)
         # What is left moves no joint.
-        return rest - found - taken, jnp.zeros_like(joints), total + found
+        none = jnp.zeros_like(joints)
+        return rest - found - taken, none, total + found, rows + by_found
 
     joints = jax.vmap(delassus.product)(free)
     rest = free if by_slip is None else free - by_slip
-    first = rest, joints, jnp.zeros_like(free)
-    return jax.lax.fori_loop(0, _TERMS, add, first)[2]
+    rows = jnp.zeros((2, delassus.is_strain.size), free.dtype)
+    first = rest, joints, jnp.zeros_like(free), rows
+    _, _, velocities, rows = jax.lax.fori_loop(0, _TERMS, add, first)
+    return velocities, rows
 
 
 def _with_resistance(
@@ -260,11 +258,11 @@ def _with_resistance(
     `M^-1 C^T eta_1` and `M^-1 C^T eta_j`.
     """
     of_slips = jnp.stack([slips[0], (slips[1] - slips[0]) / 3])
-    by_slip = _resisted(alpha, of_slips, delassus)
-    found = velocities_of_nodes(alpha, jnp.stack(free), delassus, by_slip)
-    rates = _rates_of_nodes(alpha, found) + of_slips
-    end, jump = jax.vmap(delassus.product)(_resisted(alpha, rates, delassus))
-    v1, vj = found
+    by_slips = jax.vmap(delassus.elastic_rates)(of_slips)
+    by_slip = _resisted(alpha, by_slips, delassus)
+    (v1, vj), rows = velocities_of_nodes(alpha, jnp.stack(free), delassus, by_slip)
+    taken = _resisted(alpha, _rates_of_nodes(alpha, rows) + by_slips, delassus)
+    end, jump = jax.vmap(delassus.product)(taken)
     return v1, vj, delassus.solve(jnp.stack([-end, 3 * jump]))
 
 
@@ -289,7 +287,7 @@ def skew_chord(rows: Increment, delassus: DelassusMatrix) -> Increment:
     without = free - delassus.velocity(held)
     nodes = jnp.stack([without, jnp.zeros_like(without)])
     # The sum of both velocities is `without`, divided by the denominator.
-    rate = jnp.sum(velocities_of_nodes(none, nodes, delassus), axis=0)
+    rate = jnp.sum(velocities_of_nodes(none, nodes, delassus)[0], axis=0)
     moved = inverse @ (stiff(rate) / 12)
     (eta,) = delassus.solve((rows.impulse - 0.5 * slip - delassus.product(moved))[None])
     v1 = 2 * (rate - moved - delassus.velocity(eta))

@@ -254,7 +254,7 @@ class EnergyMomentumDecaying(AbstractSchemeWithRotations[_Unknowns, _Problem]):
         right = (delassus.product(pushed), delassus.product(free) - slip)
         at_jump, at_end = delassus.solve(jnp.stack(right))
         nodes = free - delassus.velocity(at_end), pushed - delassus.velocity(at_jump)
-        v1, jump = velocities_of_nodes(alpha, jnp.stack(nodes), delassus)
+        (v1, jump), _ = velocities_of_nodes(alpha, jnp.stack(nodes), delassus)
         change = held[0] + h / 2 * rates(v1 + jump)
         strain = held[1] - h / 6 * rates(v1 - alpha * jump)
         impulse, force = impulse_and_force(change, strain)
