@@ -28,6 +28,7 @@ from enerjax._solvers import Chord, find_root, Newton, schur, schur_tables
 from enerjax._solvers.linear.block_diagonal import in_blocks
 from enerjax._solvers.linear.graph_elimination import elimination_order
 from enerjax._solvers.linear.krylov import jacobian_solver
+from enerjax._system import AbstractDampedForce
 
 from .helpers import EPS, long, SCHEMES
 
@@ -205,7 +206,7 @@ STEP = 0.1
 
 def _left_by_one_correction(scheme, system, start, rng, args=None):
     """The sizes of a residual before and after one correction of the chord method."""
-    model = make_model(system, start, args, elastic=True)
+    model = make_model(system, start, args, chord_terms=scheme.chord_terms)
     start = model.to_internal(start)
     problem = scheme.problem(model, start, jnp.asarray(STEP))
     num_constraints = model.scales.constraint.size
@@ -324,9 +325,67 @@ def test_linear_strains_take_few_corrections_in_decaying_steps(alpha, formulatio
             assert after <= max(before / 20, floor)
 
 
+class _Dampers(AbstractDampedForce):
+    """Dampers of sums of coordinates, with the resistance `args`."""
+
+    rows: jax.Array
+
+    def __call__(self, q, v, t, args=None):
+        return -args * (self.rows @ v) @ self.rows
+
+    def measures(self, q, args=None):
+        return (self.rows @ q,)
+
+    def resistances(self, q, v, t, args=None, *, delay):
+        return (args * jnp.ones(len(self.rows)),)
+
+
+def _with_dampers(with_springs, rng):
+    rows, joints = jnp.asarray(rng.normal(size=(2, 3, 12)))
+    system = ej.System(
+        jnp.diag(jnp.asarray(rng.uniform(0.5, 2, size=12))),
+        STIFF["springs"] if with_springs else lambda q, args: jnp.sum(q),
+        lambda q, args: joints @ q,
+        force=_Dampers(rows),
+    )
+    return system, ej.State(*jnp.asarray(rng.normal(size=(2, 12))), jnp.zeros(()))
+
+
+DAMPED = [(x, y) for x in ("preserving", "consistent 0") for y in (False, True)]
+
+
+@pytest.mark.parametrize(("name", "with_springs"), DAMPED[:3])
+@pytest.mark.slow_for("preserving-False")
+def test_linear_dampers_take_one_correction_too(name, with_springs):
+    """However strong they are, also beside springs."""
+    rng = np.random.default_rng(0)
+    system, start = _with_dampers(with_springs, rng)
+    for resistance in (1e2, 1e6):
+        found = _left_by_one_correction(CHORDS[name], system, start, rng, resistance)
+        before, left = found
+        # Round-off, by the condition of resistance and stiffness beside the inertia.
+        assert left <= 100 * EPS * STEP * resistance * before
+
+
+@pytest.mark.parametrize("alpha", [0.0, pytest.param(1.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("with_springs", [False, True])
+@pytest.mark.slow_for("False-0.0")
+def test_linear_dampers_take_few_corrections_in_decaying_steps(alpha, with_springs):
+    rng = np.random.default_rng(0)
+    system, start = _with_dampers(with_springs, rng)
+    for resistance in (1.0, 30.0, 1e3, 1e6):
+        sizes = _sizes_of_corrections(
+            ej.EnergyDecaying(alpha), system, start, rng, resistance
+        )
+        # By the third power of a third each, as with strains.
+        floor = 1e3 * EPS * (1 + STEP * resistance) * sizes[0]
+        for before, after in zip(sizes[1:-1], sizes[2:], strict=True):
+            assert after <= max(before / 20, floor)
+
+
 def _sizes_of_corrections(scheme, system, start, rng, args):
     """The sizes of the residuals before a few corrections of the chord method."""
-    model = make_model(system, start, args, elastic=True)
+    model = make_model(system, start, args, chord_terms=scheme.chord_terms)
     start = model.to_internal(start)
     problem = scheme.problem(model, start, jnp.asarray(STEP))
     none = jnp.zeros(model.scales.constraint.size)
@@ -633,6 +692,41 @@ def test_springs_do_not_need_newton_however_stiff_they_are(searched_by):
     )
 
 
+@pytest.mark.parametrize("scheme", [ej.EnergyPreserving(), ej.EnergyDecaying(0.5)])
+def test_dampers_and_servos_do_not_need_newton_however_strong_they_are(searched_by, scheme):
+    """A spatial chain with dampers and servos that no step resolves in its hinges."""
+
+    def torque(view, t, args, k):
+        return args["gain"] * (0.1 * t - view.angle(f"servo {k}") - view.rate(f"servo {k}"))
+
+    parts = []
+    for k, (before, axis) in enumerate(zip(("ground", "0", "1"), np.eye(3), strict=True)):
+        ends = before, str(k)
+        at = [0.3 * k, 0.0, 0.1 * k]
+        body = ej.bodies.RigidBody(str(k), 1.0, [0.01, 0.02, 0.03], at)
+        hinge = ej.joints.Revolute(f"hinge {k}", *ends, point_b=[-0.15, 0, 0], axis=axis)
+        spring = ej.forces.TorsionSpring(f"spring {k}", *ends, 50.0, axis=axis)
+        damper = ej.forces.TorsionDamper(f"damper {k}", *ends, 1e4, axis=axis)
+        servo = ej.forces.TorsionActuator(
+            f"servo {k}", *ends, functools.partial(torque, k=k), axis=axis
+        )
+        parts += [body, hinge, spring, servo if k == 1 else damper]
+    scene = ej.Scene(parts, gravity=[0, 1, -9.81], args=dict(gain=1e4))
+    system, start, args = scene.build()
+    run = lambda finder: ej.simulate(
+        system, scheme, start, args, h=0.01, num_steps=20, root_finder=finder
+    )
+    sol = run(Newton())
+    assert searched_by == ["ChordAlone"]
+    by_newton = run(Newton(linear_solver=lx.LU()))
+    # Solver: round-off of the forces of the dampers over 20 steps.
+    np.testing.assert_allclose(sol.ys.q, by_newton.ys.q, rtol=0, atol=1e-10)
+    assert jnp.max(jnp.abs(sol.audit.leak)) <= 1e4 * EPS
+    assert "6 of the rows are those of strains and dampers" in str(
+        ej.explain(system, scheme, start, args)
+    )
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_each_round_eliminates_what_causes_the_least_fill(seed):
     draw, count = np.random.default_rng(seed), 40
@@ -673,7 +767,7 @@ def test_the_stiffness_of_a_net_is_left_to_newton():
     held = lambda q, args: q[:2]
     system = ej.System(jnp.eye(2 * size**2), springs, held)
     start = ej.State(jnp.zeros(2 * size**2), jnp.zeros(2 * size**2))
-    model = make_model(system, start, None, elastic=True)
+    model = make_model(system, start, None, chord_terms=(("strains",),))
     assert isinstance(model, SeparableModel)
     assert model.has_delassus_matrix
     assert model.elastic_tables is None

@@ -149,7 +149,8 @@ def resistance(system: System, state: State, args: Args, h: Scalar) -> Elasticit
     found = force.resistances(state.q, state.v, state.t, args, delay=0.5 * h)
     units = [jnp.eye(_in_rows(x).shape[1], dtype=h.dtype) for x in found]
     stiffness = [
-        2 / h * _in_rows(x)[:, :, None] * unit for x, unit in zip(found, units, strict=True)
+        2 / h * _in_rows(x)[:, :, None] * unit[None]
+        for x, unit in zip(found, units, strict=True)
     ]
     values = lambda q: [_in_rows(x) for x in force.measures(q, args)]
     return Elasticity(values, stiffness)

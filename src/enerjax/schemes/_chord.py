@@ -197,7 +197,7 @@ def _resisted(alpha: Scalar, rates: _Rows, delassus: DelassusMatrix) -> _Nodes:
     share, (end, jump) = (1 + alpha) / 12, rates
     of_strains = jnp.stack([0.5 * (end + jump), (alpha * jump - end) / 6]) / share
     of_dampers = rates / jnp.sqrt(share)
-    return delassus.pulled(jnp.where(delassus.is_strain, of_strains, of_dampers))
+    return delassus.pulled(jnp.where(delassus.is_strain[None], of_strains, of_dampers))
 
 
 def _by_adjoint(alpha: Scalar, rows: _Rows, delassus: DelassusMatrix) -> _Nodes:
@@ -209,7 +209,7 @@ def _by_adjoint(alpha: Scalar, rows: _Rows, delassus: DelassusMatrix) -> _Nodes:
     ]
     of_dampers = [alpha / 6 * end - 0.5 * jump, end / 6 + 0.5 * jump]
     both = jnp.stack(of_strains) / share, jnp.stack(of_dampers) / jnp.sqrt(share)
-    return delassus.pulled(jnp.where(delassus.is_strain, *both))
+    return delassus.pulled(jnp.where(delassus.is_strain[None], *both))
 
 
 def _rates_of_nodes(alpha: Scalar, velocities: Float[Array, "2 n"]) -> Float[Array, "2 n"]:
