@@ -13,7 +13,7 @@ from .._operators import AbstractModel
 from .._programs import in_any_lane, is_known
 from .._results import RESULTS
 from .._solvers import ROOT
-from .._system import State
+from .._system import order_for, State
 from .._types import Count, Flag, Real, Scalar
 from ..schemes import AbstractScheme, AbstractSchemeWithMemory
 from .collocation import end_of, Pair, rates, rates_along
@@ -211,7 +211,7 @@ class _ControlledPlan(AbstractPlan):
         error, reached = _constant(self._error(*known))
         solved = result == RESULTS.successful
         accepted = solved & (error <= 1)
-        power = 1 / estimate_order(self.order)
+        power = 1 / estimate_order(order_for(model.system, self.order))
         error = jnp.maximum(error, _SMALLEST_ERROR)
         grown = _SAFETY * error ** (-_PROPORTIONAL * power)
         grown = grown * memory.error ** (_INTEGRAL * power)

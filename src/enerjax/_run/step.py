@@ -11,7 +11,7 @@ from .._operators import AbstractModel, local_error, make_model
 from .._programs import compiled, in_one_function
 from .._results import first_of, RESULTS
 from .._solvers import ChordAlone, largest, Newton, RootFinder
-from .._system import AbstractSystem, State
+from .._system import AbstractSystem, order_for, State
 from .._types import Args, Coordinates, Count, Flag, Multipliers, Real, Scalar, Velocities
 from ..schemes import (
     AbstractScheme,
@@ -148,7 +148,7 @@ def advance(
         newton_iterations=jnp.sum(iterations),
         residual=largest(residuals),
         halvings=jnp.max(halvings),
-        local_error=local_error(sizes, scheme.order),
+        local_error=local_error(sizes, order_for(model.system, scheme.order)),
         result=first_of(results),
         warm=Warm(memory, rest),
     )

@@ -2,6 +2,7 @@ from .base import (
     AbstractSystem as AbstractSystem,
     Driven as Driven,
     Force as Force,
+    order_for as order_for,
     State as State,
     Symmetry as Symmetry,
 )

@@ -144,3 +144,8 @@ def check_functions(system: AbstractSystem, required: str) -> None:
         value = getattr(system, name, None)
         if value is not None:
             check_function(name, value, SIGNATURES[name])
+
+
+def order_for(system: AbstractSystem, order: int) -> int:
+    """The order of a scheme of this order on a system: forces limit it to 2."""
+    return order if system.force is None else min(order, 2)

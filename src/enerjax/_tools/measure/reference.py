@@ -13,7 +13,7 @@ from ..._operators import make_model
 from ..._programs import compiled
 from ..._results import RESULTS
 from ..._run import SaveAt, simulate, Solution
-from ..._system import AbstractSystem, State
+from ..._system import AbstractSystem, order_for, State
 from ..._types import Args, Scalar
 from ...schemes import AbstractScheme, Composed, EnergyPreserving
 
@@ -110,7 +110,7 @@ def extrapolated(task: Task, finest: int, scheme: AbstractScheme | None) -> Refe
     forced = task.system.force is not None
     if scheme is None:
         scheme = EnergyPreserving() if forced else Composed(EnergyPreserving(), 6)
-    order = min(scheme.order, 2) if forced else scheme.order
+    order = order_for(task.system, scheme.order)
     coarse, fine = (_reached(task, scheme, factor * finest) for factor in _FINER)
     gain = (_FINER[1] / _FINER[0]) ** order - 1
     q, v = (b + (b - a) / gain for a, b in zip(coarse, fine, strict=True))
