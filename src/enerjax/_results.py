@@ -83,6 +83,11 @@ class RESULTS(eqx.Enumeration):
     restitution_out_of_range = (
         "The restitution of an `Impact` is not between 0 and 1 for these `args`."
     )
+    invalid_energy = (
+        "The kinetic energy is not `1/2 v . M v` with symmetric positive definite `M`, or "
+        "not that of the `rigid_bodies`. The same call outside of `jit` and `vmap` says "
+        "what is wrong."
+    )
     interrupted = (
         "The run was interrupted. The same call with `resume=solution`, or with the same "
         "`checkpoint`, makes the rest."
@@ -106,6 +111,7 @@ _NAMES = (
     "impacts_unresolved",
     "inconsistent_reset",
     "restitution_out_of_range",
+    "invalid_energy",
     "interrupted",
 )
 

@@ -44,7 +44,10 @@ class Progress(eqx.Module):
 
 
 class Stepper(eqx.Module):
-    """What all steps of a run have in common."""
+    """What all steps of a run have in common.
+
+    `checked` is the outcome of checks before the first step.
+    """
 
     scheme: AbstractScheme
     model: AbstractModel
@@ -52,6 +55,7 @@ class Stepper(eqx.Module):
     root_finder: RootFinder | ChordAlone
     max_halvings: int | None = eqx.field(static=True)
     watcher: Watcher | None = None
+    checked: RESULTS = eqx.field(default_factory=lambda: RESULTS.successful)
 
     def model_at(self, progress: Progress) -> AbstractModel:
         """The model that events have left."""
@@ -68,7 +72,7 @@ class Stepper(eqx.Module):
             t = plan.time(place)
             watch, varying, opens = self.watcher.begin(model, timed, t, h)
             model = eqx.combine(varying, model)
-        result = _check_start(scheme, model, timed, h)
+        result = first_failure(self.checked, _check_start(scheme, model, timed, h))
         result = result if opens is None else first_failure(result, opens)
         acceleration, multipliers = model.accelerations(start)
         return Progress(

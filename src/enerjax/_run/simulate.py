@@ -157,6 +157,7 @@ def simulate(
         root_finder=root_finder,
         max_halvings=max_halvings,
         watcher=watcher,
+        is_checked=at_top_level(values_of((system, start, args))),
     )
     with explained_memory_error(plan.max_attempts):
         if options is None:

@@ -118,7 +118,7 @@ class Solution(eqx.Module):
         kinetic, potential = self.audit.kinetic, self.audit.potential
         # A kinetic energy below the round-off of the potential energy counts as rest.
         rest = jnp.finfo(kinetic.dtype).eps * jnp.nanmax(jnp.abs(potential), axis=-1)
-        # That of a Hamiltonian with a vector potential, `H(q, p) - H(q, 0)`, may be negative.
+        # `H(q, p) - H(q, 0)` may be negative, if there is a vector potential.
         largest = jnp.maximum(jnp.nanmax(jnp.abs(kinetic), axis=-1), rest)
         total = jnp.sum(self.stats.local_error, axis=-1)
         return total / jnp.sqrt(2 * jnp.where(largest > 0, largest, jnp.inf))

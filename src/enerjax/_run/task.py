@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from .._operators import AbstractModel
+from .._results import RESULTS
 from .._solvers import ChordAlone, RootFinder
-from .._system import AbstractSystem, State
+from .._system import AbstractSystem, has_valid_energy, State
 from .._types import Args, Coordinates, Scalar
 from ..schemes import AbstractScheme
 from .audit import audit, Measures, measures
@@ -29,7 +30,10 @@ _MANY = 128
 
 
 class Task(NamedTuple):
-    """The checked arguments of `simulate`."""
+    """The checked arguments of `simulate`.
+
+    - `is_checked`: whether the values of the kinetic energy have been checked too.
+    """
 
     system: AbstractSystem
     scheme: AbstractScheme
@@ -41,6 +45,7 @@ class Task(NamedTuple):
     root_finder: RootFinder | ChordAlone
     max_halvings: int | None
     watcher: Watcher | None = None
+    is_checked: bool = True
 
     def stepper(self) -> Stepper:
         system, watcher = self.system, self.watcher
@@ -53,7 +58,13 @@ class Task(NamedTuple):
             root_finder=self.root_finder,
             max_halvings=self.max_halvings,
             watcher=self.watcher,
+            checked=RESULTS.successful if self.is_checked else self._checked(),
         )
+
+    def _checked(self) -> RESULTS:
+        """The outcome of checks in the program of a run whose numbers are traced."""
+        valid = has_valid_energy(self.system, self.start, self.args)
+        return RESULTS.where(valid, RESULTS.successful, RESULTS.invalid_energy)
 
     @property
     def observes_in_loop(self) -> bool:

@@ -21,6 +21,7 @@ from .checks.values import (
     check_without_rotations as check_without_rotations,
     closes_over_traced_values as closes_over_traced_values,
     direction_without_symmetry as direction_without_symmetry,
+    has_valid_energy as has_valid_energy,
 )
 from .damping import AbstractDampedForce as AbstractDampedForce
 from .elements import Elements as Elements

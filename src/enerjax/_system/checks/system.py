@@ -1,7 +1,7 @@
 """Checks of a system, its state and its `args`, before any step.
 
 Shapes and types are always checked. Values are checked if they are known, which is outside
-of `jit`, `vmap` and `grad`.
+of `jit` and `vmap`.
 """
 
 import functools
@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..._programs import as_array, is_known
+from ..._programs import as_array, is_known, values_of
 from ..._types import Args, Real
 from ..base import AbstractSystem, State
 from .shapes import check_shapes
@@ -53,8 +53,9 @@ def check_system(
         raise ValueError(f"The time of the start must be a finite number, got {t}.")
     state = State(q, v, as_array(t, q.dtype) if system.is_timed else None)
     check_shapes(system, state, args)
-    if is_known((system, state, args)):
-        check_values(system, state, args)
+    known = values_of((system, state, args))
+    if is_known(known):
+        check_values(*known)
     return state, args
 
 

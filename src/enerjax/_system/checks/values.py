@@ -103,6 +103,41 @@ def _definiteness(system: AbstractSystem, inertia: Symmetric) -> dict[str, Flag]
     )
 
 
+def has_valid_energy(system: AbstractSystem, state: State, args: Args) -> Flag:
+    """Whether the kinetic energy is one that schemes can use; for traced numbers too."""
+    system, state, args = jax.tree.map(
+        lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, (system, state, args)
+    )
+    inertia = system.inertia(state, args)
+    blocks, eps = scaled_blocks(inertia), 1e3 * jnp.finfo(inertia.dtype).eps
+    symmetric = jnp.all(jnp.abs(blocks - jnp.swapaxes(blocks, 1, 2)) <= eps)
+    valid = symmetric & _definiteness(system, inertia)["definite"]
+    if not isinstance(system, HamiltonianSystem):
+        valid = valid & _has_form(system, state, args)
+    return valid & _is_rigid(system, state, inertia, args)
+
+
+def _has_form(system: AbstractSystem, state: State, args: Args) -> Flag:
+    """Whether the kinetic energy is a quadratic form of the velocities, by the law of
+    parallelograms `T(a + b) + T(a - b) = 2 T(a) + 2 T(b)`, up to half of the digits."""
+    assert isinstance(system, System | LagrangianSystem)
+    if not callable(system.kinetic):
+        return jnp.array(True)
+    q, v = state.q, state.v
+    size, number = 1 + jnp.max(jnp.abs(v)), jnp.arange(1, v.size + 1, dtype=v.dtype)
+    a, b = size * jnp.cos(number), size * jnp.sin(2 * number)
+    moved = 1e-2 * (1 + jnp.max(jnp.abs(q))) * direction_without_symmetry(q)
+    # Another term can vanish at the start. Elsewhere the energy may not be defined.
+    places = jnp.stack([q, q + moved]) if isinstance(system, LagrangianSystem) else q[None]
+    energy = lambda q, v: system.kinetic_energy(State(q, v), args)
+    probes = jnp.stack([a + b, a - b, a, b])
+    found = jax.vmap(lambda q: jax.vmap(lambda v: energy(q, v))(probes))(places)
+    signs = jnp.array([1, 1, -2, -2], found.dtype)
+    error, most = jnp.abs(found @ signs), jnp.abs(found) @ jnp.abs(signs)
+    off = error > jnp.sqrt(jnp.finfo(found.dtype).eps) * most
+    return ~jnp.any(off & jnp.isfinite(error))
+
+
 def _is_quadratic(
     system: AbstractSystem, state: State, inertia: Symmetric, args: Args
 ) -> Array:
