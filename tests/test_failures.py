@@ -259,3 +259,64 @@ def test_derivatives_of_a_failed_run_raise():
     # Outside of `jit` the values are known, and the error is that of a run.
     with pytest.raises(RuntimeError, match="failed in step 1, from t = 0 to 1.5"):
         jax.grad(end)(start.v, 1.5)
+
+
+# Kinetic energies that are checked in the program -----------------------------------------
+
+
+def _rotating(q, v, args):
+    return 0.5 * v @ v + args["rate"] * (q[0] * v[1] - q[1] * v[0])
+
+
+def _masses(v, args):
+    return 0.5 * args["rate"] * v @ v
+
+
+BAD_ENERGIES = {
+    "a linear term": ej.System.from_lagrangian(_rotating, lambda q, args: 0.5 * q @ q),
+    "a constant": ej.System(
+        lambda v, args: 0.5 * v @ v + args["rate"], lambda q, args: 0.5 * q @ q
+    ),
+    "a quartic term": ej.System(
+        lambda v, args: 0.5 * v @ v + args["rate"] * v[0] ** 4, lambda q, args: 0.5 * q @ q
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD_ENERGIES)
+def test_a_lane_whose_kinetic_energy_is_no_quadratic_form_fails(name):
+    """The energy is valid for the rate zero."""
+    start = ej.State(jnp.zeros(2), jnp.array([0.1, 0.3]))
+
+    def run(rate, throw=False):
+        args, scheme = dict(rate=rate), ej.EnergyPreserving()
+        system = BAD_ENERGIES[name]
+        return ej.simulate(system, scheme, start, args, h=0.1, num_steps=3, throw=throw)
+
+    sol = jax.vmap(run)(jnp.array([0.0, 1.0]))
+    expected = ("successful", "invalid_energy")
+    for lane, outcome in enumerate(expected):
+        assert jax.tree.map(lambda x, k=lane: x[k], sol.result) == getattr(
+            ej.RESULTS, outcome
+        )
+    assert jnp.isfinite(sol.ys.q[0]).all()
+    assert jnp.isnan(sol.ys.q[1, 1:]).all()
+    # Outside of `jit` the values of a derivative are known, and the error says more.
+    with pytest.raises(ValueError, match="quadratic"):
+        jax.grad(lambda rate: run(rate, throw=True).ys.q[-1, 0])(1.0)
+
+
+def test_a_negative_mass_fails_under_jit_too():
+    system = ej.System(_masses, lambda q, args: 0.5 * q @ q)
+    start = ej.State(jnp.zeros(2), jnp.ones(2))
+    run = jax.jit(lambda rate: ej.simulate(
+        system,
+        ej.EnergyPreserving(),
+        start,
+        dict(rate=rate),
+        h=0.1,
+        num_steps=3,
+        throw=False,
+    ).result)  # fmt: skip
+    assert run(1.0) == ej.RESULTS.successful
+    assert run(-1.0) == ej.RESULTS.invalid_energy

@@ -1,7 +1,9 @@
 """The phase error: a run's own estimate of its accuracy."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
 
 import enerjax as ej
 
@@ -31,6 +33,28 @@ def test_the_estimate_follows_the_error_of_an_oscillator(scheme):
     )
     assert unresolved.phase_error > 1
     assert "phase of the motion, by local errors: to about" in str(unresolved)
+
+
+def test_forces_limit_the_order_of_the_estimate():
+    """A forced oscillator: the estimate is no less than the error at any step."""
+    system = ej.System(
+        jnp.eye(1),
+        lambda q, args: 0.5 * q @ q,
+        force=lambda q, v, t, args: -0.1 * v + jnp.cos(3.0 * t),
+    )
+    start = ej.State(jnp.ones(1), jnp.zeros(1))
+    wanted = scipy.integrate.solve_ivp(
+        lambda t, y: [y[1], -y[0] - 0.1 * y[1] + np.cos(3 * t)],
+        (0, 10),
+        [1.0, 0.0],
+        rtol=1e-11,
+        atol=1e-12,
+    ).y[0, -1]
+    for steps in (200, 800):
+        scheme = ej.EnergyConsistent(0.0)
+        sol = ej.simulate(system, scheme, start, h=10 / steps, num_steps=steps)
+        error = abs(float(sol.ys.q[-1, 0]) - wanted)
+        assert error < sol.phase_error < 1e3 * error
 
 
 @pytest.mark.slow
