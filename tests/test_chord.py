@@ -348,7 +348,8 @@ def _with_dampers(with_springs, rng):
         lambda q, args: joints @ q,
         force=_Dampers(rows),
     )
-    return system, ej.State(*jnp.asarray(rng.normal(size=(2, 12))), jnp.zeros(()))
+    q, v = jnp.asarray(rng.normal(size=(2, 12)))
+    return system, ej.State(q, v, jnp.zeros(()))
 
 
 DAMPED = [(x, y) for x in ("preserving", "consistent 0") for y in (False, True)]

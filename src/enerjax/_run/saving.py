@@ -228,6 +228,11 @@ class AbstractSaving(eqx.Module):
         """The saving that makes the same rows of groups that ended where they were due."""
 
 
+def check_saveat(saveat: Any) -> None:
+    if not isinstance(saveat, SaveAt):
+        raise TypeError(f"`saveat` must be a `SaveAt`, got {saveat!r}.")
+
+
 def saving_of(
     saveat: SaveAt, plan: AbstractPlan, controller: AbstractController, max_every: int
 ) -> AbstractSaving:

@@ -19,7 +19,7 @@ from .failure import explained_memory_error, raise_failure
 from .inputs import check_halvings, prepare
 from .long_run import checked_options, run_long
 from .loop import run_loop
-from .saving import RecordedRun, SaveAt, saving_of, with_events
+from .saving import check_saveat, RecordedRun, SaveAt, saving_of, with_events
 from .solution import first_rows, Solution
 from .stage import is_chord_alone
 from .step_sizes import AbstractController, EqualSteps, find_end
@@ -56,8 +56,9 @@ def simulate(
     `h`, the numbers of the scheme (`alpha`), `start` and all inexact leaves of `args` are
     traced: new values never recompile, and `vmap`, `grad`, `jvp` and `jit` work over each.
     Write a number that you want to change as `1.0`, not `1`: Python integers are part
-    of the program. For derivatives with respect to the start, create the start inside the
-    differentiated function with `initial_state`, so that it stays on the constraints.
+    of the program. For derivatives with respect to the start, or to numbers in the
+    constraints, such as lengths, create the start inside the differentiated function with
+    `initial_state`, so that it stays on the constraints.
 
     **Arguments:**
 
@@ -132,8 +133,7 @@ def simulate(
     `solution`; without `throw` this is returned. `ValueError` for a file or solution of
     another run.
     """
-    if not isinstance(saveat, SaveAt):
-        raise TypeError(f"`saveat` must be a `SaveAt`, got {saveat!r}.")
+    check_saveat(saveat)
     check_halvings(max_halvings)
     options = checked_options(progress, checkpoint, checkpoint_seconds, resume)
     prepared = prepare(system, scheme, start, args, h, t0, root_finder)
