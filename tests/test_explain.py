@@ -32,6 +32,26 @@ def test_a_small_system_is_one_function():
     assert "one function of machine code: yes" in text
 
 
+def test_forces_that_need_newton_are_noticed():
+    """A pendulum in a viscous fluid: the force is one of the user's."""
+    system, start, args = problem("double")
+    damped = ej.System(
+        system.kinetic,
+        system.potential,
+        system.constraint,
+        force=lambda q, v, t, args: -args["c"] * v,
+    )
+    explained = lambda damping: ej.explain(
+        damped, ej.EnergyPreserving(), start, args | dict(c=damping), h=1e-2
+    )
+    soft, stiff = explained(1.0), explained(1e4)
+    # `h/2 c/m` with masses of one; truncation of the power iteration.
+    assert soft.contraction == pytest.approx(5e-3, rel=1e-3)
+    assert stiff.contraction == pytest.approx(50, rel=1e-3)
+    assert "Newton's method" not in str(soft).splitlines()[4]
+    assert "so steps are solved by Newton's method" in str(stiff)
+
+
 def test_a_composition_has_several_solves():
     scheme = ej.Composed(ej.EnergyPreserving(), 4)
     assert explained("double", scheme).solves == len(scheme.stages) > 1

@@ -18,8 +18,9 @@ from .._programs import (
     values_of,
 )
 from .._solvers import ChordAlone
-from .._system import closes_over_traced_values, System
-from .._types import Scalar
+from .._system import AbstractSystem, closes_over_traced_values, State, System
+from .._types import Args, Scalar
+from ..schemes import AbstractScheme
 from .experience import Experience
 from .loop import dispensable_newton
 from .step import model_for
@@ -28,7 +29,7 @@ from .task import Task
 
 # The largest contraction, the fraction of an error that a correction leaves, for which the
 # chord method is tried alone.
-_CONTRACTS = 0.25
+CONTRACTS = 0.25
 # The passes of the power iteration; the estimate needs no digits.
 _PASSES = 10
 
@@ -58,8 +59,8 @@ def chord_alone(task: Task, experience: Experience) -> ChordAlone | None:
         experience.is_linear = is_separable and _is_linear(system, task)
     # NaN compares false: such a run fails in any program.
     if not experience.is_linear:
-        contraction = values_of(_contraction(task))
-        if bool(contraction > _CONTRACTS):
+        of_task = task.scheme, system, task.start, task.args, task.plan.unit
+        if bool(values_of(contraction(*of_task)) > CONTRACTS):
             return None
     return ChordAlone(newton)
 
@@ -74,14 +75,16 @@ def _is_linear(system: System, task: Task) -> bool:
 
 
 @compiled_for_once
-def _contraction(task: Task) -> Scalar:
+def contraction(
+    scheme: AbstractScheme, system: AbstractSystem, start: State, args: Args, h: Scalar
+) -> Scalar:
     """An estimate, at the start, of the contraction of the chord method by stiff forces.
 
     With constant inertia it is the spectral radius of `h^2/4 M^-1 K + h/2 M^-1 D`, with the
     stiffness and damping of the forces that its matrix omits, by power iteration.
     """
-    model = model_for(task.scheme, task.system, task.start, task.args)
-    start, h = model.to_internal(task.start), task.plan.unit
+    model = model_for(scheme, system, start, args)
+    start = model.to_internal(start)
     is_separable = isinstance(model, SeparableModel)
     inertia = model.inertia if is_separable else model.metric(start)
     size = lambda v: jnp.sqrt(v @ inertia @ v)

@@ -18,9 +18,10 @@ from .._run.stage import (
 )
 from .._run.step import model_for
 from .._run.step_sizes import End, EqualSteps
+from .._run.without_jacobian import contraction, CONTRACTS
 from .._solvers import ChordAlone, flattened, linearisable, Newton, RootFinder, SMALL
 from .._system import AbstractSystem, State
-from .._types import Args, Scalar
+from .._types import Args, Real, Scalar
 from ..schemes import AbstractScheme
 
 
@@ -37,6 +38,9 @@ class Explanation:
     - `chord`: how the matrix `B M^-1 B^T` of the constraints, and of strains where their
       stiffness is included, is eliminated; `None` where the chord method is not used, or
       there are no constraints.
+    - `contraction`: how much of an error a correction of the chord method leaves, by the
+      forces that this matrix omits, at the start and for steps of length `h`. Above 0.25
+      programs have Newton's method from the beginning. `None` without an `h`.
     - `jacobian`: how the exact Jacobian is stored and eliminated.
     - `obstacles`: the operations that keep a step from being one function of machine code,
       with the places where they are called; empty if it is one function.
@@ -49,6 +53,7 @@ class Explanation:
     unknowns: dict[str, int]
     method: str
     chord: str | None
+    contraction: float | None
     jacobian: str
     obstacles: tuple[str, ...]
     operations: int
@@ -61,6 +66,7 @@ class Explanation:
             f"a step: {solves}, each of {sum(self.unknowns.values())} unknowns ({parts})",
             f"method: {self.method}",
             *([] if self.chord is None else [f"matrix of the constraints: {self.chord}"]),
+            *([] if self.contraction is None else [self._omitted(self.contraction)]),
             f"exact Jacobian: {self.jacobian}",
             f"step equations: about {self.operations} scalar operations",
         ]
@@ -71,6 +77,12 @@ class Explanation:
             lines += [f"    {obstacle}" for obstacle in self.obstacles]
         return "\n".join(lines)
 
+    def _omitted(self, contraction: float) -> str:
+        found = f"forces that it omits: a correction leaves {contraction:.2g} of an error"
+        if not contraction > CONTRACTS:
+            return found
+        return f"{found}, so steps are solved by Newton's method"
+
 
 def explain(
     system: AbstractSystem,
@@ -78,6 +90,7 @@ def explain(
     start: State,
     args: Args = None,
     *,
+    h: Real | None = None,
     root_finder: RootFinder = Newton(),
 ) -> Explanation:
     """What a step of a system by a scheme computes, without computing it.
@@ -86,13 +99,15 @@ def explain(
     the step is one function of machine code, or because of which operations it is not. A
     step that is not one function takes several times as long if the system is small.
 
-    **Arguments:** as for `simulate`.
+    **Arguments:** as for `simulate`. With the length `h` of a step (time) it also tells
+    whether the forces are so stiff that the chord method is of no use.
 
     **Returns:** an `Explanation`; `print` it.
 
     **Raises:** `ValueError` or `TypeError` for bad input, as `simulate` does.
     """
-    start, args, h, *_ = prepare(system, scheme, start, args, 1.0, 0.0, root_finder)
+    length = 1.0 if h is None else h
+    start, args, step, *_ = prepare(system, scheme, start, args, length, 0.0, root_finder)
     found: list[Explanation] = []
 
     # Everything is found while this function is traced.
@@ -101,8 +116,11 @@ def explain(
         found.append(_explained(scheme, model, model.to_internal(start), h, root_finder))
         return h
 
-    jax.eval_shape(traced, start, args, h)
-    return found[0]
+    jax.eval_shape(traced, start, args, step)
+    if h is None or not found[0].method.startswith(_CHORD):
+        return found[0]
+    left = float(contraction(scheme, system, start, args, jnp.asarray(step)))
+    return dataclasses.replace(found[0], contraction=left)
 
 
 def _explained(
@@ -145,6 +163,7 @@ def _explained(
         unknowns=_unknowns(z),
         method=_BY_CHORD.format(newton) if by_chord else newton,
         chord=_chord(model) if by_chord else None,
+        contraction=None,
         jacobian=jacobian,
         obstacles=why_not_one_function(step, begin),
         operations=num_operations(
@@ -153,7 +172,8 @@ def _explained(
     )
 
 
-_BY_CHORD = "chord method, without the exact Jacobian; if that fails in a step, {}"
+_CHORD = "chord method"
+_BY_CHORD = _CHORD + ", without the exact Jacobian; if that fails in a step, {}"
 
 
 def _equations(z: Any, args: Any) -> Any:
