@@ -31,6 +31,7 @@ from enerjax._solvers.linear.krylov import jacobian_solver
 from enerjax._system import AbstractDampedForce
 
 from .helpers import EPS, long, SCHEMES
+from .third_party_parts import Drag
 
 
 SIZE = 30
@@ -726,6 +727,19 @@ def test_dampers_and_servos_do_not_need_newton_however_strong_they_are(searched_
     assert "6 of the rows are those of strains and dampers" in str(
         ej.explain(system, scheme, start, args)
     )
+
+
+@pytest.mark.parametrize("name", ["preserving", "decaying"])
+@pytest.mark.slow_for("decaying")
+def test_a_law_without_a_slope_at_rest_is_left_out(searched_by, name):
+    """`-c |v| v`: its slope at rest is the derivative of the root of zero."""
+    body = ej.bodies.RigidBody("rod", 1.0, [0.01, 0.02, 0.03], [0.5, 0.0, 0.0])
+    hinge = ej.joints.Revolute("hinge", "ground", "rod", [0, 0, 0], axis=[0, 1, 0])
+    drag = Drag("drag", "ground", "rod", 0.1)
+    system, start, args = ej.Scene([body, hinge, drag], gravity=[0, 0, -9.81]).build()
+    sol = ej.simulate(system, CHORDS[name], start, args, h=0.01, num_steps=20)
+    assert searched_by == ["ChordAlone"]
+    assert jnp.max(jnp.abs(sol.audit.leak)) <= 1e3 * EPS
 
 
 @pytest.mark.parametrize("seed", range(4))

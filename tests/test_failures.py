@@ -306,6 +306,21 @@ def test_a_lane_whose_kinetic_energy_is_no_quadratic_form_fails(name):
         jax.grad(lambda rate: run(rate, throw=True).ys.q[-1, 0])(1.0)
 
 
+def test_a_kinetic_energy_over_a_traced_number_is_checked_too():
+    start = ej.State(jnp.zeros(2), jnp.array([0.1, 0.3]))
+
+    def failed(rate):
+        system = ej.System(
+            lambda v, args: 0.5 * v @ v + rate * v[0] ** 4, lambda q, args: 0.5 * q @ q
+        )
+        sol = ej.simulate(
+            system, ej.EnergyPreserving(), start, h=0.1, num_steps=3, throw=False
+        )
+        return sol.result == ej.RESULTS.invalid_energy
+
+    assert jax.vmap(failed)(jnp.array([0.0, 1.0])).tolist() == [False, True]
+
+
 def test_a_negative_mass_fails_under_jit_too():
     system = ej.System(_masses, lambda q, args: 0.5 * q @ q)
     start = ej.State(jnp.zeros(2), jnp.ones(2))

@@ -417,6 +417,37 @@ def test_shapes_that_cannot_touch_are_no_contacts(tmp_path, bits):
             ej.scenes.from_mjcf(written(tmp_path, text.format(exclude)))
 
 
+@pytest.mark.parametrize(
+    "axes",
+    [
+        ("0 0 1", "0 1 1.5"),
+        pytest.param(("0 0 1", "1 1 1", "2 0.5 1"), marks=pytest.mark.slow),
+    ],
+)
+def test_armatures_of_hinges_in_a_row_are_those_of_their_angles(tmp_path, axes):
+    """At oblique axes too the torque on a coordinate is its armature times its
+    acceleration."""
+    joints = "".join(
+        f'<joint name="{k}" axis="{axis}" armature="0.1"/>' for k, axis in enumerate(axes)
+    )
+    velocities = " ".join(["0.3", "-0.2", "0.4"][: len(axes)])
+    text = (
+        f'<mujoco><worldbody><body name="w">{joints}'
+        '<geom type="box" size=".1 .2 .3" pos=".2 .1 -.3"/></body></worldbody>'
+        f'<keyframe><key name="k" qvel="{velocities}"/></keyframe></mujoco>'
+    )
+    scene = ej.scenes.from_mjcf(written(tmp_path, text), keyframe="k")
+    system, start, args = scene.build()
+    h = 1e-4
+    sol = ej.simulate(system, ej.EnergyPreserving(), start, args, h=h, num_steps=3)
+    for k in range(len(axes)):
+        rates = scene.measure(sol, f"{k}").rate
+        force = scene.measure(sol, f"{k} armature").force
+        # Truncation, of the force in the middle of the step.
+        wanted = float(-0.1 * (rates[2] - rates[1]) / h)
+        assert float(force[2]) == pytest.approx(wanted, rel=1e-4)
+
+
 HINGES = '<joint axis="1 0 0"/><joint axis="0 1 0"/><joint axis="0 0 1"/>'
 
 
@@ -427,6 +458,7 @@ HINGES = '<joint axis="1 0 0"/><joint axis="0 1 0"/><joint axis="0 0 1"/>'
         ('<joint axis="1 0 0"/><joint axis="2 0 0" pos="0 1 0"/>', "parallel axes"),
         ('<joint type="slide"/><joint type="slide"/>', "one follows from the others"),
         (HINGES.replace("0 0 1", "1 0 0"), "gimbal lock"),
+        ('<joint axis="1 0 0"/><joint type="ball"/>', "a ball joint and a hinge"),
         ("", "no body with a joint"),
     ],
 )

@@ -147,6 +147,8 @@ def resistance(system: System, state: State, args: Args, h: Scalar) -> Elasticit
     if not isinstance(force, AbstractDampedForce) or state.t is None:
         return Elasticity(lambda q: [], [])
     found = force.resistances(state.q, state.v, state.t, args, delay=0.5 * h)
+    # The slope of a law such as `-c |v| v` may be undefined at rest.
+    found = [jnp.where(jnp.isfinite(x), x, 0) for x in found]
     units = [jnp.eye(_in_rows(x).shape[1], dtype=h.dtype) for x in found]
     stiffness = [
         2 / h * _in_rows(x)[:, :, None] * unit[None]

@@ -41,7 +41,7 @@ def at_all_places(
     Those that are no slices are one gather: the transpose of each adds numbers to all
     entries of `x`, also where few are read.
     """
-    keys = [places.tobytes() for places in all_places]
+    keys = [places.astype(int).tobytes() for places in all_places]
     by_key = dict(zip(keys, all_places, strict=True))
     scattered = {key: places for key, places in by_key.items() if not _step(places)}
     if len(scattered) > 1:

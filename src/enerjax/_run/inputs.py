@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._programs import as_array, is_known
+from .._programs import as_array, at_top_level, is_known, values_of
 from .._solvers import RootFinder
 from .._system import (
     AbstractSystem,
@@ -19,6 +19,7 @@ from .._system import (
     check_number,
     check_system,
     check_without_rotations,
+    closes_over_traced_values,
     describe,
     State,
 )
@@ -94,6 +95,12 @@ def prepare(
     if is_known((scheme, system, start, args)):
         check_derivatives(scheme, system, start, args, experience)
     return Prepared(start, args, step, as_array(t, step.dtype), experience)
+
+
+def is_checked(system: AbstractSystem, start: State, args: Args) -> bool:
+    """Whether the values of a run were known, so that they have been checked."""
+    known = values_of((system, start, args))
+    return at_top_level(known) and not closes_over_traced_values(*known)
 
 
 def positive_integer(name: str, count: Any) -> int:

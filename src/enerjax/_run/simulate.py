@@ -16,7 +16,7 @@ from ..schemes import AbstractScheme
 from .events import AbstractEvent
 from .experience import Experience
 from .failure import explained_memory_error, raise_failure
-from .inputs import check_halvings, prepare
+from .inputs import check_halvings, is_checked, prepare
 from .long_run import checked_options, run_long
 from .loop import run_loop
 from .saving import check_saveat, RecordedRun, SaveAt, saving_of, with_events
@@ -157,7 +157,7 @@ def simulate(
         root_finder=root_finder,
         max_halvings=max_halvings,
         watcher=watcher,
-        is_checked=at_top_level(values_of((system, start, args))),
+        is_checked=is_checked(system, start, args),
     )
     with explained_memory_error(plan.max_attempts):
         if options is None:

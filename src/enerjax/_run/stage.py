@@ -310,7 +310,7 @@ def _chord(scheme: AbstractOneSolveScheme, model: AbstractModel) -> Chord:
         z = _with_multipliers(jax.tree.map(jnp.multiply, x, scales.unknown), new)
         return jax.tree.map(jnp.multiply, z, scales.per_unknown)
 
-    return Chord(prepare, correct, effective, bool(terms_of_chord(model)))
+    return Chord(prepare, correct, effective, "strains" in terms_of_chord(model))
 
 
 def num_unknowns(memory: Memory) -> int:

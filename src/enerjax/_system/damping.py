@@ -41,8 +41,9 @@ class AbstractDampedForce(eqx.Module):
         *,
         delay: Scalar,
     ) -> MeasureArrays:
-        """`c`, in arrays of the shape of the measures (energy per measure and rate).
+        """`c`, in arrays of the shape of the measures (force per rate of a measure).
 
-        That of a force with a gain `k` on the measure itself includes `delay * k`: over a
+        Of a vector these are the sums of the slopes by all its components. That of a force
+        with a gain `k` on the measure itself includes `delay * k`: over a
         short time the measure changes by `delay` times its rate.
         """

@@ -161,13 +161,20 @@ class AbstractTurn(AbstractMeasure):
 
 @dataclass(frozen=True)
 class Turn(AbstractTurn):
-    """The angle about an axis that both bodies have in common."""
+    """The angle about an axis that both bodies have in common.
+
+    - `seen_from_b`: whether the angle is that of a direction of the first body in the axes
+      of the second.
+    """
 
     reads = ("axes",)
+    seen_from_b: bool = False
 
     def components(self, a: Frame, b: Frame, numbers: Numbers) -> tuple[Scalar, Scalar]:
-        x, y = (a.direction(numbers["frame_a"][k]) for k in (0, 1))
-        turned = b.direction(numbers["frame_b"][0])
+        ends = (a, numbers["frame_a"]), (b, numbers["frame_b"])
+        (fixed, axes), (moved, directions) = reversed(ends) if self.seen_from_b else ends
+        x, y = (fixed.direction(axes[k]) for k in (0, 1))
+        turned = moved.direction(directions[0])
         return jnp.sum(turned * x), jnp.sum(turned * y)
 
 

@@ -255,14 +255,16 @@ def _places_of_updates(
     return np.where(falls, places, -1).ravel()
 
 
-# The part of all places that may be added up by themselves, and the passes over all places
-# from which on they are.
-_FEW_PLACES, _USUAL_PASSES = 8, 2
+# The part of all places that may be added up by themselves, and the least and the most
+# passes over all places.
+_FEW_PLACES, _PASSES = 8, (2, 8)
 
 
 def _added(self: "Evaluation", operand, updates, places, dtype) -> Value:
     """Updates added to known places."""
     size, count = math.prod(operand.shape), math.prod(updates.shape)
+    if size == 0:
+        return operand
     order = np.argsort(places, kind="stable")
     order = order[places[order] >= 0]
     to = places[order]
@@ -272,7 +274,7 @@ def _added(self: "Evaluation", operand, updates, places, dtype) -> Value:
     # The few places with many updates, such as a body that many others are attached to, are
     # added up by themselves: passes over all places would be many.
     passes = np.sort(np.bincount(to, minlength=size))[-1 - size // _FEW_PLACES]
-    often = np.unique(to[before >= max(passes, _USUAL_PASSES)])
+    often = np.unique(to[before >= np.clip(passes, *_PASSES)])
     is_often = np.isin(to, often)
     out = operand
     if often.size:

@@ -114,7 +114,9 @@ def has_valid_energy(system: AbstractSystem, state: State, args: Args) -> Flag:
     valid = symmetric & _definiteness(system, inertia)["definite"]
     if not isinstance(system, HamiltonianSystem):
         valid = valid & _has_form(system, state, args)
-    return valid & _is_rigid(system, state, inertia, args)
+    valid = valid & _is_rigid(system, state, inertia, args)
+    # A number that is not finite is told by the first step.
+    return valid | ~jnp.all(jnp.isfinite(blocks))
 
 
 def _has_form(system: AbstractSystem, state: State, args: Args) -> Flag:

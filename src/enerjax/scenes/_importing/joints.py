@@ -177,6 +177,11 @@ class ChainGeometry:
     def _check(self) -> None:
         """Raises for chains whose rows would not describe the motion."""
         axes, told = self.here.axes, f"The joints of '{self.here.name}'"
+        if self.hinges and "ball" in self.here.kinds:
+            raise ValueError(
+                f"{told} are a ball joint and a hinge. The angle of the hinge does not "
+                "follow from the pose of the body: put a body between them."
+            )
         if len(self.hinges) > 3:
             raise ValueError(
                 f"{told} are {len(self.hinges)} hinges in a row. At most three angles "
@@ -260,20 +265,20 @@ class ChainGeometry:
 
     def _of_two(self, number: int, ends: tuple[int, str, str, str]) -> Coordinate:
         """The coordinate of one of two hinges: the angle of the axis of the other one in
-        the body where its own axis is fixed, which comes first."""
-        joint, label, outer, own = ends
+        the body where its own axis is fixed."""
         here, is_first = self.here, number == 0
         k, other = self.hinges[number], self.hinges[1 - number]
-        places = (here.outer, here.own) if is_first else (here.own, here.outer)
-        bodies = (outer, own) if is_first else (own, outer)
         turned = basis(here.axes[other])[[2, 0, 1]]
+        names = ("frame_a", "frame_b") if is_first else ("frame_b", "frame_a")
+        places = (here.outer, here.own) if is_first else (here.own, here.outer)
 
         def frames(value: float) -> Numbers:
             x, y = self._seen_from(k, other, value, is_first)
-            rows = x, y, np.cross(x, y)
-            return dict(frame_a=_all(places[0], rows), frame_b=_all(places[1], turned))
+            rows = (x, y, here.axes[k]), turned
+            pairs = zip(names, places, rows, strict=True)
+            return {name: _all(place, own) for name, place, own in pairs}
 
-        return Coordinate(joint, label, *bodies, Turn(), frames)
+        return Coordinate(*ends, Turn(seen_from_b=not is_first), frames)
 
     def _turn_at_end(self, k: int, value: float) -> Numbers:
         """The numbers of the angle of the first or the last of three hinges."""
@@ -289,7 +294,9 @@ class ChainGeometry:
         along = first @ last - (first @ axis) * (axis @ last)
         at_rest = np.arctan2(axis @ np.cross(first, last), along)
         angle = at_rest + value - self.here.zeros[k]
-        return dict(turn=np.array([np.cos(angle), np.sin(angle)]))
+        # Both axes are seen shorter than they are.
+        sines = [np.linalg.norm(np.cross(axis, x)) for x in (first, last)]
+        return dict(turn=np.array([np.cos(angle), np.sin(angle)]) / np.prod(sines))
 
     def _seen_from(
         self, k: int, other: int, value: float, is_first: bool
@@ -297,13 +304,14 @@ class ChainGeometry:
         """Where the axis of an `other` hinge is seen along the axis of the hinge `k` when
         the coordinate has a value, and the direction in which it turns from there.
 
-        They are unit vectors of the file's body in its rest pose, and fixed in the body
-        before the hinge if this `is_first`, else in the one behind it.
+        They are vectors of the file's body in its rest pose, and fixed in the body before
+        the hinge if this `is_first`, else in the one behind it. Their length makes up for
+        that of the axis, which is seen shorter than it is.
         """
         axis, zero = self.here.axes[k], self.here.zeros[k]
         seen = self.here.axes[other] - axis @ self.here.axes[other] * axis
         sign = 1 if is_first else -1
-        x = _rotated(seen / np.linalg.norm(seen), axis, sign * (value - zero))
+        x = _rotated(seen / (seen @ seen), axis, sign * (value - zero))
         return x, sign * np.cross(axis, x)
 
     def _in_stage(self, stage: int, x: np.ndarray) -> np.ndarray:
