@@ -72,7 +72,12 @@ class StepOutput(eqx.Module):
 
 
 def model_for(
-    scheme: AbstractScheme, system: AbstractSystem, state: State, args: Args
+    scheme: AbstractScheme,
+    system: AbstractSystem,
+    state: State,
+    args: Args,
+    *,
+    omits_dampers: bool = False,
 ) -> AbstractModel:
     """The model of a system for a scheme, which may move rigid bodies by rotations, and may
     include stiffness and damping in its chord method."""
@@ -80,6 +85,8 @@ def model_for(
     has_rotations = isinstance(stage, AbstractSchemeWithRotations)
     rotates_in = stage.rotates_in if has_rotations else ()
     terms = stage.chord_terms if isinstance(stage, AbstractSchemeWithChord) else ()
+    if omits_dampers:
+        terms = tuple(x for x in terms if "dampers" not in x)
     return make_model(system, state, args, rotates_in=rotates_in, chord_terms=terms)
 
 

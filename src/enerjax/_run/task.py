@@ -53,7 +53,14 @@ class Task(NamedTuple):
             system = watcher.system(system, self.start.q.dtype)
         return Stepper(
             scheme=self.scheme,
-            model=model_for(self.scheme, system, self.start, self.args),
+            model=model_for(
+                self.scheme,
+                system,
+                self.start,
+                self.args,
+                omits_dampers=isinstance(self.root_finder, ChordAlone)
+                and self.root_finder.omits_dampers,
+            ),
             plan=self.plan,
             root_finder=self.root_finder,
             max_halvings=self.max_halvings,

@@ -18,7 +18,13 @@ from .._programs import (
     values_of,
 )
 from .._solvers import ChordAlone
-from .._system import AbstractSystem, closes_over_traced_values, State, System
+from .._system import (
+    AbstractDampedForce,
+    AbstractSystem,
+    closes_over_traced_values,
+    State,
+    System,
+)
 from .._types import Args, Scalar
 from ..schemes import AbstractScheme
 from .experience import Experience
@@ -30,6 +36,8 @@ from .task import Task
 # The largest contraction, the fraction of an error that a correction leaves, for which the
 # chord method is tried alone.
 CONTRACTS = 0.25
+# That by dampers below which their rows cost more than they save.
+_WEAK = 0.02
 # The passes of the power iteration; the estimate needs no digits.
 _PASSES = 10
 
@@ -60,6 +68,9 @@ def chord_alone(task: Task, experience: Experience) -> ChordAlone | None:
     # NaN compares false: such a run fails in any program.
     if not experience.is_linear:
         of_task = task.scheme, system, task.start, task.args, task.plan.unit
+        if isinstance(system.force, AbstractDampedForce):
+            if bool(values_of(contraction(*of_task, omits_dampers=True)) < _WEAK):
+                return ChordAlone(newton, omits_dampers=True)
         if bool(values_of(contraction(*of_task)) > CONTRACTS):
             return None
     return ChordAlone(newton)
@@ -76,14 +87,20 @@ def _is_linear(system: System, task: Task) -> bool:
 
 @compiled_for_once
 def contraction(
-    scheme: AbstractScheme, system: AbstractSystem, start: State, args: Args, h: Scalar
+    scheme: AbstractScheme,
+    system: AbstractSystem,
+    start: State,
+    args: Args,
+    h: Scalar,
+    *,
+    omits_dampers: bool = False,
 ) -> Scalar:
     """An estimate, at the start, of the contraction of the chord method by stiff forces.
 
     With constant inertia it is the spectral radius of `h^2/4 M^-1 K + h/2 M^-1 D`, with the
     stiffness and damping of the forces that its matrix omits, by power iteration.
     """
-    model = model_for(scheme, system, start, args)
+    model = model_for(scheme, system, start, args, omits_dampers=omits_dampers)
     start = model.to_internal(start)
     is_separable = isinstance(model, SeparableModel)
     inertia = model.inertia if is_separable else model.metric(start)

@@ -87,9 +87,13 @@ class ChordAlone(eqx.Module):
 
     The exact Jacobian is more than half of the program of a step, and smooth motion does
     not need it. `newton` has the tolerances; it searches where there is no chord method.
+
+    - `omits_dampers`: whether the matrix of the chord method has no rows of dampers,
+      because they are weak.
     """
 
     newton: Newton
+    omits_dampers: bool = eqx.field(default=False, static=True)
 
 
 class Start(eqx.Module):

@@ -33,8 +33,8 @@ class Moving(View):
       with an `axis_b`, where its `frame_a` and `frame_b` agree), and jumps at half a turn.
     - `rate(name)`: of this angle or length. It does not jump.
 
-    With `added` all these angles or lengths, and their rates, are told with this much
-    added, so that the gains of a feedback are derivatives.
+    `added` is added to all these angles and lengths, and to all these rates. The gains of a
+    feedback are derivatives by these two numbers.
     """
 
     def __init__(

@@ -95,8 +95,8 @@ class View:
         ]
 
     def _of_moving(self, field: str, wanted: Sequence[np.ndarray]) -> list[Array]:
-        """The same where none is on the ground as a whole. The field of a few bodies is
-        computed for these alone."""
+        """The same for arrays that each contain a body that moves. The field of a few
+        bodies is computed for these alone."""
         few = np.unique(np.concatenate(wanted))
         few, count = few[few > 0], len(self.layout.turning)
         if count <= _MANY or few.size > _FEW * count:
