@@ -443,6 +443,7 @@ def test_armatures_of_hinges_in_a_row_are_those_of_their_angles(tmp_path, axes):
     for k in range(len(axes)):
         rates = scene.measure(sol, f"{k}").rate
         force = scene.measure(sol, f"{k} armature").force
+        assert force is not None
         # Truncation, of the force in the middle of the step.
         wanted = float(-0.1 * (rates[2] - rates[1]) / h)
         assert float(force[2]) == pytest.approx(wanted, rel=1e-4)
