@@ -71,7 +71,7 @@ def eigenvalues(
     `ValueError` for a state that is not steady, for motions that are no symmetries, and for
     constraints or symmetries that are not independent.
     """
-    state, args = check_system(system, state, args, t)
+    state, args, _ = check_system(system, state, args, t)
     symmetry = system.symmetry if symmetry is None else symmetry
     found, facts = _eigenvalues(system, symmetry, state, args)
     if is_known((found, facts)):

@@ -172,7 +172,7 @@ def at_rest(
             "Hamiltonian system need not vanish there. Describe it by `System` or "
             "`System.from_lagrangian`."
         )
-    state, args = check_system(system, state, args, t)
+    state, args, _ = check_system(system, state, args, t)
     return State(state.q, jnp.zeros_like(state.v), state.t), args
 
 

@@ -129,7 +129,7 @@ def _nearest(
     keep_known: bool,
     throw: bool,
 ) -> State:
-    checked_state, checked_args = check_system(system, state, args, t)
+    checked_state, checked_args, _ = check_system(system, state, args, t)
     if is_known((system, checked_state, checked_args)):
         # These small programs often save the compilation of the large one.
         facts = _facts(system, checked_state, checked_args)
@@ -155,7 +155,7 @@ def _start(
     keep_known: bool,
     throw: bool,
 ) -> ConsistentStart:
-    state, args = check_system(system, state, args, t)
+    state, args, _ = check_system(system, state, args, t)
     known = _known_entries(system, state, known)
     start, near, kept, rank = _project(system, state, args, known)
     if not throw:

@@ -97,7 +97,7 @@ def freedoms(
     first: Sequence[int],
 ) -> Mobility:
     """`mobility`, where the rows in `first` count before all others."""
-    state, args = check_system(system, state, args, t)
+    state, args, _ = check_system(system, state, args, t)
     scaled, root, residual = scaled_constraints(system, state, args)
     num_constraints, num_coordinates = scaled.shape
     if names is None:

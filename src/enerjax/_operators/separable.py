@@ -125,10 +125,8 @@ class SeparableModel(AbstractModel):
         self.inverse_inertia = inverse_of(self.inertia)
         self.scales = self._scales(state)
         self.constraint_tables = self._constraint_tables(state)
-        self.elastic_tables = None
-        for terms in chord_terms:
-            if self.elastic_tables is None:
-                self.elastic_tables = self._elastic_tables(state, terms)
+        tables = (self._elastic_tables(state, terms) for terms in chord_terms)
+        self.elastic_tables = next((x for x in tables if x is not None), None)
 
     @property
     def has_own_momenta(self) -> bool:
@@ -223,8 +221,9 @@ class SeparableModel(AbstractModel):
         change = 0.5 * h * jax.jvp(acceleration, (state.q, state.v), (moved, v))[1]
         if self.elastic_tables is None:
             return change
-        # The chord method does not neglect the part that the strains cause.
-        of_strains, transpose = jax.vjp(self._rates_of_strains(state, h), v)
+        # The chord method does not neglect the part that strains and dampers cause.
+        rates = self._rates_of_strains(state, h, self.elastic_tables.terms)
+        of_strains, transpose = jax.vjp(rates, v)
         return change - self.inverse_inertia @ transpose(of_strains)[0]
 
     def velocity(self, state: State) -> Velocities:
@@ -461,9 +460,9 @@ class SeparableModel(AbstractModel):
         weight, added = self._weight(), self.delassus_regularisation
         rest = jnp.zeros((weight.shape[0],), q.dtype)
         if h is not None and self.elastic_tables is not None:
-            rates = self._rates_with_strains(state, h)
-            both = self.elastic_tables.schurs(rates, rest, weight, added)
             tables = self.elastic_tables
+            rates = self._rates_with_strains(state, h, tables.terms)
+            both = tables.schurs(rates, rest, weight, added)
             return DelassusMatrix(
                 self.inverse_inertia, both[0], None, added, both[1], tables.num_strains
             )
@@ -473,18 +472,17 @@ class SeparableModel(AbstractModel):
         return DelassusMatrix(self.inverse_inertia, rows, frames, added)
 
     def _rates_with_strains(
-        self, state: State, h: Scalar
+        self, state: State, h: Scalar, terms: ChordTerms
     ) -> Callable[[Velocities], Float[Array, " rows"]]:
-        """The rates of the joints, followed by the rows of the strains."""
+        """The rates of the joints, followed by the rows of strains and dampers."""
         joints = self._rates_of_joints(state.q, state.t, None)
-        strains = self._rates_of_strains(state, h)
+        strains = self._rates_of_strains(state, h, terms)
         return lambda v: jnp.concatenate([joints(v), strains(v)])
 
     def _rates_of_strains(
-        self, state: State, h: Scalar
+        self, state: State, h: Scalar, terms: ChordTerms
     ) -> Callable[[Velocities], Float[Array, " rows"]]:
-        """The rows of the strains, and of the dampers if the chord method has them."""
-        terms = () if self.elastic_tables is None else self.elastic_tables.terms
+        """The rows of strains and dampers, of those that `terms` contains."""
         strains = self._strains(state, h, terms)
         return elastic_rates(strains, state.q, h, lambda v: self.lift(state.q, v))
 
@@ -512,15 +510,9 @@ class SeparableModel(AbstractModel):
         counts = [self._strains(still, unit, (term,)).num_strains for term in terms]
         if min(counts) == 0 or sum(counts) > rest.size:
             return None
-        joints = self._rates_of_joints(q, t, None)
-        strains = self._strains(still, unit, terms)
-        rows = elastic_rates(strains, q, unit, lambda v: self.lift(q, v))
-        tables = elastic_tables(
-            lambda v: jnp.concatenate([joints(v), rows(v)]),
-            self.constraint_tables.num_rows,
-            rest,
-            self.inverse_inertia,
-        )
+        rates = self._rates_with_strains(still, unit, terms)
+        num_joints = self.constraint_tables.num_rows
+        tables = elastic_tables(rates, num_joints, rest, self.inverse_inertia)
         if tables is None:
             return None
         num_strains = dict(zip(terms, counts, strict=True)).get("strains", 0)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._programs import as_array, at_top_level, is_known, values_of
+from .._programs import as_array, is_known
 from .._solvers import RootFinder
 from .._system import (
     AbstractSystem,
@@ -19,7 +19,6 @@ from .._system import (
     check_number,
     check_system,
     check_without_rotations,
-    closes_over_traced_values,
     describe,
     State,
 )
@@ -36,6 +35,7 @@ class Prepared(NamedTuple):
     - `h`, `t`: the length of a step and the time of the start in the dtype of the start;
       those that the user gives as numbers of Python or NumPy are NumPy's.
     - `experience`: what earlier calls have shown of the system.
+    - `is_checked`: whether the values were known, and have been checked.
     """
 
     start: State
@@ -43,6 +43,7 @@ class Prepared(NamedTuple):
     h: Scalar
     t: Scalar
     experience: Experience
+    is_checked: bool
 
 
 def prepare(
@@ -67,7 +68,7 @@ def prepare(
             + (": the parentheses are missing." if isinstance(scheme, type) else ".")
         )
     check_not_varying((scheme, h))
-    start, args = check_system(system, start, args, t)
+    start, args, is_checked = check_system(system, start, args, t)
     if system.force is not None and min(scheme.stages) < 0:
         raise ValueError(
             f"`{type(scheme).__name__}` has stages that go backwards in time, in which a "
@@ -94,13 +95,8 @@ def prepare(
         check_without_rotations(system, start, args, type(scheme.stage).__name__)
     if is_known((scheme, system, start, args)):
         check_derivatives(scheme, system, start, args, experience)
-    return Prepared(start, args, step, as_array(t, step.dtype), experience)
-
-
-def is_checked(system: AbstractSystem, start: State, args: Args) -> bool:
-    """Whether the values of a run were known, so that they have been checked."""
-    known = values_of((system, start, args))
-    return at_top_level(known) and not closes_over_traced_values(*known)
+    at = as_array(t, step.dtype)
+    return Prepared(start, args, step, at, experience, is_checked)
 
 
 def positive_integer(name: str, count: Any) -> int:

@@ -16,7 +16,7 @@ from ..schemes import AbstractScheme
 from .events import AbstractEvent
 from .experience import Experience
 from .failure import explained_memory_error, raise_failure
-from .inputs import check_halvings, is_checked, prepare
+from .inputs import check_halvings, prepare
 from .long_run import checked_options, run_long
 from .loop import run_loop
 from .saving import check_saveat, RecordedRun, SaveAt, saving_of, with_events
@@ -137,7 +137,7 @@ def simulate(
     check_halvings(max_halvings)
     options = checked_options(progress, checkpoint, checkpoint_seconds, resume)
     prepared = prepare(system, scheme, start, args, h, t0, root_finder)
-    start, args, step, begin, experience = prepared
+    start, args, step, begin, experience, is_checked = prepared
     end = find_end(num_steps, t1, max_steps, controller, h, t0, step.dtype)
     plan = controller.plan(scheme, step, begin, end)
     longest = plan.max_attempts if options is None else sys.maxsize
@@ -157,7 +157,7 @@ def simulate(
         root_finder=root_finder,
         max_halvings=max_halvings,
         watcher=watcher,
-        is_checked=is_checked(system, start, args),
+        is_checked=is_checked,
     )
     with explained_memory_error(plan.max_attempts):
         if options is None:

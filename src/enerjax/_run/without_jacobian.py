@@ -36,7 +36,7 @@ from .task import Task
 # The largest contraction, the fraction of an error that a correction leaves, for which the
 # chord method is tried alone.
 CONTRACTS = 0.25
-# That by dampers below which their rows cost more than they save.
+# The contraction without rows of dampers below which these cost more than they save.
 _WEAK = 0.02
 # The passes of the power iteration; the estimate needs no digits.
 _PASSES = 10
@@ -98,7 +98,8 @@ def contraction(
     """An estimate, at the start, of the contraction of the chord method by stiff forces.
 
     With constant inertia it is the spectral radius of `h^2/4 M^-1 K + h/2 M^-1 D`, with the
-    stiffness and damping of the forces that its matrix omits, by power iteration.
+    stiffness and damping of the forces that its matrix omits, by power iteration. With
+    `omits_dampers` the matrix has no rows of dampers.
     """
     model = model_for(scheme, system, start, args, omits_dampers=omits_dampers)
     start = model.to_internal(start)

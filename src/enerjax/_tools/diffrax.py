@@ -76,7 +76,7 @@ def to_diffrax(
             "`to_diffrax` needs diffrax, which is part of the extra `diffrax`: "
             'python -m pip install "enerjax[diffrax]"'
         ) from error
-    start, args = check_system(system, start, args, t0)
+    start, args, _ = check_system(system, start, args, t0)
     model = _model(system, start, args)
     begin = model.to_internal(start)
     return diffrax.ODETerm(IndexReduced(model)), (begin.q, begin.v)

@@ -22,8 +22,11 @@ from .values import check_values
 
 def check_system(
     system: AbstractSystem, state: State, args: Args, t: Real
-) -> tuple[State, Args]:
-    """Checks a system with a state, `args` and a time, and returns these as arrays."""
+) -> tuple[State, Args, bool]:
+    """Checks a system with a state, `args` and a time.
+
+    Returns the state and `args` as arrays, and whether values were known and checked.
+    """
     if not isinstance(system, AbstractSystem):
         raise TypeError(f"`system` must be an `enerjax.System`, got {type(system)}.")
     check_not_varying((system, state, args, t))
@@ -54,9 +57,7 @@ def check_system(
     state = State(q, v, as_array(t, q.dtype) if system.is_timed else None)
     check_shapes(system, state, args)
     known = values_of((system, state, args))
-    if is_known(known):
-        check_values(*known)
-    return state, args
+    return state, args, is_known(known) and check_values(*known)
 
 
 def check_not_varying(tree: Any) -> None:

@@ -207,17 +207,20 @@ def check_without_rotations(
         )
 
 
-def check_values(system: AbstractSystem, state: State, args: Args) -> None:
-    """Raises an error for the first condition that the values of a system violate."""
+def check_values(system: AbstractSystem, state: State, args: Args) -> bool:
+    """Raises an error for the first condition that the values of a system violate.
+
+    Returns whether they are known: the functions of the system may close over tracers.
+    """
     facts = _facts(system, state, args)
-    if not is_known(facts):  # the functions of the system close over tracers
-        return
+    if not is_known(facts):
+        return False
     # The messages contain all numbers as text, which takes longer than a short run.
     violated = [
         name for name, ok in zip(_CONDITIONS, np.asarray(facts), strict=True) if not ok
     ]
     if not violated:
-        return
+        return True
     functions = {role: describe(role, fn) for role, fn, _ in energies(system, state, args)}
     kinetic = functions.get("kinetic", functions.get("hamiltonian"))
     potential = functions.get("potential", kinetic)
@@ -227,6 +230,7 @@ def check_values(system: AbstractSystem, state: State, args: Args) -> None:
     for name in violated:
         if name in messages:
             raise ValueError(messages[name])
+    return True
 
 
 def _messages_of_start(potential: str | None, state: State, args: Args) -> dict[str, str]:

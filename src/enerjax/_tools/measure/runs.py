@@ -69,7 +69,7 @@ def measure(
     repeats: int,
 ) -> Runs:
     system, start, args = problem
-    start, args = check_system(system, start, args, t0)
+    start, args, _ = check_system(system, start, args, t0)
     _check(schemes, duration)
     counts = tuple(sorted({positive_integer("steps", n) for n in steps}))
     if not counts:
