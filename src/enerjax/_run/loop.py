@@ -18,9 +18,11 @@ from .._types import Count, Flag, Multipliers, Scalar
 from ..schemes import AbstractScheme, AbstractSchemeWithChord, Energies
 from .event_search import Found, no_search, settle, Watch
 from .halving import select
+from .model import model_for
 from .reverse import keep_roots, loops, moving
 from .saving import Begin, Costs, Record, with_time
-from .step import advance, first_warm, model_for, StepOutput, Warm
+from .start_check import check_start
+from .step import advance, first_warm, StepOutput, Warm
 from .step_sizes import AbstractPlan, EqualPlan, Verdict
 from .watcher import Happening, Watcher
 
@@ -72,7 +74,7 @@ class Stepper(eqx.Module):
             t = plan.time(place)
             watch, varying, opens = self.watcher.begin(model, timed, t, h)
             model = eqx.combine(varying, model)
-        result = first_failure(self.checked, _check_start(scheme, model, timed, h))
+        result = first_failure(self.checked, check_start(scheme, model, timed, h))
         result = result if opens is None else first_failure(result, opens)
         acceleration, multipliers = model.accelerations(start)
         return Progress(
@@ -268,7 +270,7 @@ def _check_resets(
     timed = with_time(model, plan, state, place)
 
     def is_bad() -> Flag:
-        found = _check_start(stepper.scheme, model, timed, plan.unit * plan.first())
+        found = check_start(stepper.scheme, model, timed, plan.unit * plan.first())
         return found != RESULTS.successful
 
     was_reset = jnp.any(happens & watcher.resets)
@@ -410,26 +412,3 @@ def dispensable_newton(
     ):
         return None
     return root_finder
-
-
-def _check_start(
-    scheme: AbstractScheme, model: AbstractModel, start: State, h: Scalar
-) -> RESULTS:
-    """Whether the start satisfies the constraints of the scheme, to half the digits.
-
-    An error would stay in the energy balance of the first step. The displacement or
-    velocity that would repair it is compared with that of a step, so the position of the
-    origin does not matter.
-    """
-    scales, eps = model.scales, jnp.finfo(h.dtype).eps
-    root = jnp.sqrt(model.energy_scale(start, h))
-    # NaN compares false: such a start fails in its first step.
-    tolerance = 1e2 * jnp.sqrt(eps) * root
-    position = jnp.abs(model.constraint(start.q, start.t))
-    unit, terms = map(model.holonomic, (scales.constraint, scales.constraint_size))
-    rounding = 1e3 * eps * terms
-    bad = jnp.any(position > h * tolerance * unit + rounding)
-    if scheme.stage.formulation == "ggl":
-        rate = jnp.abs(model.joint_rate(start.q, start.v, start.t))
-        bad = bad | jnp.any(rate > tolerance * scales.constraint[: rate.size])
-    return RESULTS.where(bad, RESULTS.inconsistent_start, RESULTS.successful)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from .._operators import AbstractModel, local_error, make_model
+from .._operators import AbstractModel, local_error
 from .._programs import compiled, in_one_function
 from .._results import first_of, RESULTS
 from .._solvers import ChordAlone, largest, Newton, RootFinder
@@ -15,15 +15,15 @@ from .._system import AbstractSystem, order_for, State
 from .._types import Args, Coordinates, Count, Flag, Multipliers, Real, Scalar, Velocities
 from ..schemes import (
     AbstractScheme,
-    AbstractSchemeWithChord,
-    AbstractSchemeWithRotations,
     Energies,
 )
 from .halving import solve_or_divide
 from .inputs import check_halvings, prepare
+from .model import model_for
 from .prediction import Memory
 from .reverse import scan
 from .stage import first_memory
+from .start_check import with_checked_rates
 
 
 class Warm(eqx.Module):
@@ -69,25 +69,6 @@ class StepOutput(eqx.Module):
     local_error: Scalar
     result: RESULTS
     warm: Warm
-
-
-def model_for(
-    scheme: AbstractScheme,
-    system: AbstractSystem,
-    state: State,
-    args: Args,
-    *,
-    omits_dampers: bool = False,
-) -> AbstractModel:
-    """The model of a system for a scheme, which may move rigid bodies by rotations, and may
-    include stiffness and damping in its chord method."""
-    stage = scheme.stage
-    has_rotations = isinstance(stage, AbstractSchemeWithRotations)
-    rotates_in = stage.rotates_in if has_rotations else ()
-    terms = stage.chord_terms if isinstance(stage, AbstractSchemeWithChord) else ()
-    if omits_dampers:
-        terms = tuple(x for x in terms if "dampers" not in x)
-    return make_model(system, state, args, rotates_in=rotates_in, chord_terms=terms)
 
 
 def first_warm(
@@ -227,6 +208,7 @@ def step(
     system with events.
     """
     state, args, h, *_ = prepare(system, scheme, state, args, h, t, root_finder)
+    system, args = with_checked_rates(system, scheme, state, args, h)
     check_halvings(max_halvings)
     if system.events:
         raise ValueError(

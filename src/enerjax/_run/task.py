@@ -17,9 +17,9 @@ from ..schemes import AbstractScheme
 from .audit import audit, Measures, measures
 from .events import Events
 from .loop import Progress, Stepper
+from .model import model_for
 from .saving import AbstractSaving, Record, Rows, SaveFunction
 from .solution import Solution, Statistics
-from .step import model_for
 from .step_sizes import AbstractPlan
 from .watcher import Watcher
 

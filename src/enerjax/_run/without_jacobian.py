@@ -29,7 +29,7 @@ from .._types import Args, Scalar
 from ..schemes import AbstractScheme
 from .experience import Experience
 from .loop import dispensable_newton
-from .step import model_for
+from .model import model_for
 from .task import Task
 
 

@@ -10,13 +10,13 @@ from .._operators import AbstractModel, Increment, SeparableModel
 from .._programs import num_operations, simplified, why_not_one_function
 from .._run.inputs import prepare
 from .._run.loop import dispensable_newton, Stepper
+from .._run.model import model_for
 from .._run.stage import (
     free_flight,
     is_chord_alone,
     owners_of,
     step_problem,
 )
-from .._run.step import model_for
 from .._run.step_sizes import End, EqualSteps
 from .._run.without_jacobian import contraction, CONTRACTS
 from .._solvers import ChordAlone, flattened, linearisable, Newton, RootFinder, SMALL
