@@ -1,5 +1,6 @@
 """Derivatives of a run with respect to all numbers: forward, reverse and by differences."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -397,3 +398,91 @@ def test_first_and_second_derivatives_of_the_first_multipliers():
     for x, y in zip(jax.tree.leaves(values), jax.tree.leaves(expected), strict=True):
         # Round-off of two solutions.
         np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9)
+
+
+def level(q, args):
+    """The potential energy without gravity."""
+    del args
+    return 0 * q[0]
+
+
+def rolling(q, args):
+    """A wheel on a line, `(x, angle)`."""
+    del q
+    return jnp.array([[1.0, -args["radius"]]])
+
+
+# Systems with numbers in the constraints, a start, and the numbers for which a run with
+# another value needs another start.
+HELD_STARTS = dict(
+    length=(PENDULUM, [1.0, 0.0], [0.0, 0.0], dict(g=9.81, l=1.0, m=1.3), {"l"}),
+    driven=(
+        ej.System(
+            jnp.eye(1), level, driven=lambda q, t, p: q - p["a"] * jnp.sin(p["w"] * t)
+        ),
+        [0.0],
+        [0.6],
+        dict(a=0.2, w=3.0),
+        {"a", "w"},
+    ),
+    driven_from_rest=(
+        ej.System(
+            jnp.eye(1), level, driven=lambda q, t, p: q - p["a"] * (1 - jnp.cos(3 * t))
+        ),
+        [0.0],
+        [0.0],
+        dict(a=0.2),
+        set(),
+    ),
+    rolling=(
+        ej.System(jnp.diag(jnp.array([2.0, 0.3])), level, nonholonomic=rolling),
+        [0.0, 0.0],
+        [0.5, 1.0],
+        dict(radius=0.5),
+        {"radius"},
+    ),
+)
+
+
+@pytest.mark.parametrize("name", HELD_STARTS)
+def test_a_start_that_does_not_move_with_a_length_has_no_derivative(name):
+    system, q, v, args, wrong = HELD_STARTS[name]
+    start = ej.State(jnp.array(q), jnp.array(v))
+
+    def last(args):
+        solution = ej.simulate(
+            system, ej.EnergyPreserving(), start, args, h=0.01, num_steps=5
+        )
+        return jnp.sum(solution.ys.q[-1])
+
+    for key in args:
+        of_one = jax.grad(lambda x, key=key: last({**args, key: x}))
+        if key in wrong:
+            with pytest.raises(ValueError, match=rf"respect to `args\['{key}'\]`"):
+                of_one(args[key])
+        else:
+            assert np.isfinite(of_one(args[key]))
+    # In `jit` the values are not known before the program runs.
+    found = jax.jit(jax.grad(last))(args)
+    assert {key for key, slope in found.items() if np.isnan(slope)} == wrong
+
+
+def test_a_number_of_the_system_itself_is_named():
+    class Rod(eqx.Module):
+        l: jax.Array
+
+        def __call__(self, q, args):
+            del args
+            return jnp.array([q @ q - self.l**2])
+
+    start = ej.State(jnp.array([1.0, 0.0]), jnp.zeros(2))
+
+    def last(l):
+        system = ej.System(jnp.eye(2), lambda q, _: q[1], Rod(l))
+        out = ej.step(system, ej.EnergyDecaying(0.5), start, h=0.01)
+        return out.state.q[0]
+
+    with pytest.raises(ValueError, match=r"respect to `system\.constraint\.l`"):
+        jax.grad(last)(jnp.array(1.0))
+    held = lambda l: last(jax.lax.stop_gradient(l))
+    assert jax.grad(held)(jnp.array(1.0)) == 0

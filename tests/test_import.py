@@ -449,6 +449,29 @@ def test_armatures_of_hinges_in_a_row_are_those_of_their_angles(tmp_path, axes):
         assert float(force[2]) == pytest.approx(wanted, rel=1e-4)
 
 
+@pytest.mark.parametrize("turns", [(4.0,), (0.3, 4.0), (-5.0, 0.2, 9.0)])
+def test_springs_that_start_beyond_half_a_turn_have_the_energy_of_their_angles(
+    tmp_path, turns
+):
+    axes = ("0 1 0", "1 0 0", "0.2 0 1")[: len(turns)]
+    joints = "".join(
+        f'<joint axis="{axis}" stiffness="{2 + k}" springref="{10 * k}"/>'
+        for k, axis in enumerate(axes)
+    )
+    text = (
+        f'<mujoco><option gravity="0 0 0"/><worldbody><body>{joints}'
+        '<geom type="box" size=".1 .2 .3" pos=".2 .1 -.3"/></body></worldbody>'
+        f'<keyframe><key name="k" qpos="{" ".join(map(str, turns))}"/></keyframe></mujoco>'
+    )
+    scene = ej.scenes.from_mjcf(written(tmp_path, text), keyframe="k")
+    system, start, args = scene.build()
+    energies = [
+        (2 + k) / 2 * (turn - np.radians(10 * k)) ** 2 for k, turn in enumerate(turns)
+    ]
+    # Round-off.
+    assert float(system.potential(start.q, args)) == pytest.approx(sum(energies), rel=1e-13)
+
+
 HINGES = '<joint axis="1 0 0"/><joint axis="0 1 0"/><joint axis="0 0 1"/>'
 
 

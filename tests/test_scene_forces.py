@@ -190,3 +190,31 @@ def test_work_is_differentiated_with_respect_to_the_numbers_of_a_force():
     # Along a line the velocity is 1 + u force, and the work 2 (u force) + (u force)^2.
     slope, u = float(jax.jit(jax.grad(work))(0.7)), (1 - np.cos(3.0)) / 6
     assert slope == pytest.approx(2 * u + 2 * u**2 * 0.7, rel=1e-3)  # truncation
+
+
+@pytest.mark.parametrize(
+    "scheme", [ej.EnergyPreserving(), ej.EnergyDecaying(0.5), ej.EnergyConsistent(0.0)]
+)
+@pytest.mark.slow_for("scheme1", "scheme2")
+def test_an_angle_in_space_that_passes_half_a_turn_is_a_failure(scheme):
+    """There the energy of its spring is not smooth; without stiffness nothing happens."""
+    axis, ends = [0.0, 0.0, 1.0], ("ground", "rotor")
+    rotor = ej.bodies.RigidBody(
+        "rotor", 1.0, [1.0, 1.0, 1.0], [0.0, 0.0, 0.0], angular_velocity=[0.0, 0.0, 2.0]
+    )
+    pin = ej.joints.Revolute("pin", *ends, axis=axis)
+    spring = ej.forces.TorsionSpring("coil", *ends, 0.1, axis=axis)
+    system, start, args = ej.Scene([rotor, pin, spring]).build()
+
+    def run(stiffness):
+        numbers = args.set("coil", stiffness=stiffness)
+        sol = ej.simulate(
+            system, scheme, start, numbers, h=0.02, num_steps=100, throw=False
+        )
+        return sol.result, sol.stats.completed_steps
+
+    # The angle is `2/w sin(w t)` with `w^2 = k`, at most `2/w`. Truncation.
+    result, completed = jax.vmap(run)(jnp.array([0.0, 0.1, 0.5, 1.0]))
+    passes = np.arcsin(0.5 * np.pi * np.sqrt([0.1])) / np.sqrt([0.1])
+    assert np.array_equal(completed, [100, passes[0] // 0.02, 100, 100])
+    assert list(result == ej.RESULTS.angle_jumped) == [False, True, False, False]

@@ -88,6 +88,12 @@ class RESULTS(eqx.Enumeration):
         "not that of the `rigid_bodies`. The same call outside of `jit` and `vmap` says "
         "what is wrong."
     )
+    angle_jumped = (
+        "The angle of a torsion spring in space passed half a turn, where its energy is "
+        "not smooth. Such an angle counts from the start pose, that of a spring in a file "
+        "from its value without force: let the range of the motion lie around it. Angles "
+        "of bodies in the plane are not limited."
+    )
     interrupted = (
         "The run was interrupted. The same call with `resume=solution`, or with the same "
         "`checkpoint`, makes the rest."
@@ -112,6 +118,7 @@ _NAMES = (
     "inconsistent_reset",
     "restitution_out_of_range",
     "invalid_energy",
+    "angle_jumped",
     "interrupted",
 )
 

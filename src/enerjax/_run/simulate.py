@@ -59,7 +59,9 @@ def simulate(
     Write a number that you want to change as `1.0`, not `1`: Python integers are part
     of the program. For derivatives with respect to the start, or to numbers in the
     constraints, such as lengths, create the start inside the differentiated function with
-    `initial_state`, so that it stays on the constraints.
+    `initial_state`, so that it stays on the constraints. With respect to a number in the
+    constraints with which the start does not move there is no derivative: this is an error,
+    and where values are traced, as in `jit` and `vmap`, that derivative is NaN.
 
     **Arguments:**
 

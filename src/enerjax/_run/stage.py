@@ -35,7 +35,7 @@ from .._solvers import (
     RootFinder,
     RowPattern,
 )
-from .._system import State
+from .._system import AbstractStrainEnergy, State
 from .._types import Count, Flag, JointMultipliers, Multipliers, Scalar, Velocities
 from ..schemes import (
     AbstractOneSolveScheme,
@@ -273,6 +273,7 @@ def _solved(
     else:
         reverses = jax.lax.cond(root.by_chord, lambda: no, tests)
     branch = RESULTS.where(reverses, RESULTS.step_too_large, RESULTS.successful)
+    branch = first_failure(branch, _check_angles(model, start, end.state))
     found = from_root_finder(root.found, root.broken, root.finite)
     added = jax.lax.stop_gradient(jax.tree.map(jnp.subtract, z, prepared.flight))
     differences, before = differences_after(added, memory.differences), memory.differences
@@ -332,6 +333,20 @@ def _gradients_reverse(model: AbstractModel, a: State, b: State) -> Flag:
         rows.derivative(model.fixed, jax.lax.stop_gradient(q)) / unit for q in (a.q, b.q)
     )
     return jnp.any(jnp.sum(before * after, axis=1) < 0)
+
+
+def _check_angles(model: AbstractModel, a: State, b: State) -> RESULTS:
+    """Whether an angle of the potential has jumped by a turn: it has passed half a turn."""
+    potential = getattr(model.system, "potential", None)
+    if not isinstance(potential, AbstractStrainEnergy):
+        return RESULTS.successful
+    before, after = (
+        potential.angles(jax.lax.stop_gradient(x.q), model.args) for x in (a, b)
+    )
+    if before.size == 0:
+        return RESULTS.successful
+    jumps = jnp.any(jnp.abs(after - before) > jnp.pi)
+    return RESULTS.where(jumps, RESULTS.angle_jumped, RESULTS.successful)
 
 
 def _with_multipliers(

@@ -124,23 +124,25 @@ def _occur_in_constraints(
     moving: PyTree[Array], others: PyTree[Any], start: State
 ) -> PyTree[bool]:
     """Which of the numbers occur in constraints."""
-    numbers, unravel = ravel_pytree(moving)
+    # Coordinates and time are variables too: where they vanish, so may their factors.
+    variables, unravel = ravel_pytree((moving, start.q, start.t))
 
-    def rows(numbers: Array) -> Array:
-        system, args = eqx.combine(unravel(numbers), others)
+    def rows(variables: Array) -> Array:
+        moving, q, t = unravel(variables)
+        system, args = eqx.combine(moving, others)
         functions = (
-            (system.constraint, (start.q,)),
-            (system.driven, (start.q, start.t)),
-            (system.nonholonomic, (start.q,)),
+            (system.constraint, (q,)),
+            (system.driven, (q, t)),
+            (system.nonholonomic, (q,)),
         )
         of_each = [fn(*inputs, args) for fn, inputs in functions if fn is not None]
-        return jnp.concatenate([jnp.zeros((0,), start.q.dtype), *map(jnp.ravel, of_each)])
+        return jnp.concatenate([jnp.zeros((0,), q.dtype), *map(jnp.ravel, of_each)])
 
-    pattern = jacobian_pattern(rows, numbers)
-    occur = np.ones(numbers.size, bool) if pattern is None else pattern.sum(axis=0) > 0
+    pattern = jacobian_pattern(rows, variables)
+    occur = np.ones(variables.size, bool) if pattern is None else pattern.sum(axis=0) > 0
     leaves, structure = jax.tree.flatten(moving)
     ends = np.cumsum([x.size for x in leaves])
-    of_leaves = [bool(np.any(x)) for x in np.split(occur, ends[:-1])]
+    of_leaves = [bool(np.any(x)) for x in np.split(occur, ends)[: len(leaves)]]
     return jax.tree.unflatten(structure, of_leaves)
 
 

@@ -4,7 +4,7 @@ import abc
 from typing import TypeAlias
 
 import equinox as eqx
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .._types import Args, Coordinates, Scalar
 
@@ -32,3 +32,10 @@ class AbstractStrainEnergy(eqx.Module):
     @abc.abstractmethod
     def stresses(self, strains: StrainArrays, args: Args = None) -> StrainArrays:
         """`K Gamma` (energy per strain), linear in the strains."""
+
+    def angles(self, q: Coordinates, args: Args = None) -> Float[Array, " angles"]:
+        """Angles between minus and plus half a turn, where the energy is not smooth.
+
+        A step in which one of them passes half a turn fails. By default there are none.
+        """
+        return q[:0]

@@ -15,8 +15,9 @@ from ._beam_functions import (
     stresses,
 )
 from ._frames import Numbers
-from ._laws import AbstractForceLaw, Elastic
+from ._laws import AbstractForceLaw, AbstractSpringLaw, Elastic
 from ._layout import Layout, Links
+from ._measures import AbstractTurn
 from ._parameters import Parameters
 from ._pose_view import evaluate_all, View
 from ._user_functions import ask
@@ -60,6 +61,22 @@ class PotentialOfScene(AbstractStrainEnergy):
             for (group, numbers), own in zip(beams, strains[count:], strict=True)
         ]
         return (*of_springs, *of_beams)
+
+    def angles(self, q, args=None):
+        groups = zip(self.layout.force_groups, args.tables["forces"], strict=True)
+        in_space = [
+            (group._replace(law=group.law.measure), numbers)
+            for group, numbers in groups
+            if isinstance(group.law, AbstractSpringLaw)
+            and isinstance(group.law.measure, AbstractTurn)
+        ]
+        found = evaluate_all(in_space, View(self.layout, q))
+        # Without stiffness the energy is smooth.
+        acting = [
+            jnp.where(numbers["stiffness"] == 0, 0, angles)
+            for (_, numbers), angles in zip(in_space, found, strict=True)
+        ]
+        return jnp.concatenate([q[:0], *acting])
 
 
 def _springs(layout: Layout, args: Parameters) -> list[tuple[Links, Elastic, Numbers]]:

@@ -64,7 +64,7 @@ class TorsionSpring(AbstractForce):
     `angle` defaults to that of the start. In space `turn` is the rotation from the start
     pose about `axis`, in the frame of the first body, and `angle` defaults to zero;
     revolute or cylindrical joints must keep this axis common to both bodies. There the
-    energy jumps at half a turn, which the motion must not reach.
+    energy is not smooth at half a turn, and a run that passes it fails.
     """
 
     stiffness: Real

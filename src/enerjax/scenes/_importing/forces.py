@@ -20,7 +20,7 @@ def forces_of(tree: Tree, coordinates: list[Coordinate], names: Names) -> list[A
     """All springs, dampers and armatures of joints, and the forces against gravity."""
     found = []
     for coordinate in coordinates:
-        found += _of_coordinate(tree.model, coordinate, names)
+        found += _of_coordinate(tree, coordinate, names)
     for root in tree.roots:
         for joint in tree.joints(root):
             if tree.kind(joint) in ("ball", "free"):
@@ -30,15 +30,19 @@ def forces_of(tree: Tree, coordinates: list[Coordinate], names: Names) -> list[A
     return found + _against_gravity(tree, names)
 
 
-def _of_coordinate(model: Any, coordinate: Coordinate, names: Names) -> list[Any]:
-    found, joint = [], coordinate.joint
+def _of_coordinate(tree: Tree, coordinate: Coordinate, names: Names) -> list[Any]:
+    model, found, joint = tree.model, [], coordinate.joint
     ends, measure = (coordinate.a, coordinate.b), coordinate.measure
     label = lambda what: names.new(f"{coordinate.name} {what}", "part")
     springs, dampers = stiffness(model, joint), damping(model, joint)
     if springs.any():
-        rest = float(model.qpos_spring[model.jnt_qposadr[joint]])
-        law, own = _spring(measure, springs)
-        numbers = coordinate.numbers(rest) | own
+        place = model.jnt_qposadr[joint]
+        rest, start = float(model.qpos_spring[place]), float(tree.data.qpos[place])
+        # An angle in space jumps as far from its zero as it can: half a turn away. The zero
+        # is where the spring is at rest, or else at the start.
+        zero = rest if abs(start - rest) < 0.9 * np.pi else start
+        law, own = _spring(measure, springs, rest - zero)
+        numbers = coordinate.numbers(zero) | own
         found.append(parts.JointSpring(label("spring"), *ends, law, numbers))
     if dampers.any():
         law, own = _damper(measure, dampers)
@@ -51,10 +55,10 @@ def _of_coordinate(model: Any, coordinate: Coordinate, names: Names) -> list[Any
     return found
 
 
-def _spring(measure: AbstractMeasure, of: np.ndarray) -> tuple[AbstractLaw, Numbers]:
-    # The measure vanishes where the spring is at rest. So does an angle in space, which
-    # therefore jumps as far from there as it can.
-    numbers = dict(stiffness=of[0], rest=0.0)
+def _spring(
+    measure: AbstractMeasure, of: np.ndarray, rest: float
+) -> tuple[AbstractLaw, Numbers]:
+    numbers = dict(stiffness=of[0], rest=rest)
     if not of[1:].any():
         return Elastic(measure, "rest"), numbers
     return CubicSpring(measure, "rest"), numbers | dict(quadratic=of[1], cubic=of[2])
