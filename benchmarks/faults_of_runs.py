@@ -514,9 +514,9 @@ FAULTS = (
     ),
     Fault(
         "start: velocities are not checked",
-        "_run/loop.py",
-        "        bad = bad | jnp.any(rate > tolerance * scales.constraint[: rate.size])\n",
-        "",
+        "_run/start_check.py",
+        "    return jnp.concatenate([errors, rate / allowed])\n",
+        "    return errors\n",
         "A start whose velocities break the joints is accepted.",
         of("failures::test_an_inconsistent_start_is_a_failure_of_the_first_step"),
     ),

@@ -88,6 +88,26 @@ def test_a_penalty_has_an_exact_balance_and_approaches_the_impact():
     assert 0.8 < deepest / (2.5 * energy / 1e5) ** 0.4 < 1.0
 
 
+def test_a_penalty_without_a_damper_is_a_potential():
+    """Compositions, some of whose stages go back in time, can be used with it."""
+    law, scheme = contacts.Penalty(1e5, exponent=5.0), ej.Composed(ej.EnergyPreserving(), 4)
+    system, start, args = ej.Scene(bar(law), gravity=GRAVITY).build()
+    assert system.force is None
+    ends = [
+        ej.simulate(system, scheme, start, args, h=0.9 / n, num_steps=n).ys.q[-1]
+        for n in (225, 450, 900)
+    ]
+    # Truncation, of order 4: with this exponent the force is smooth enough.
+    assert jnp.linalg.norm(ends[1] - ends[0]) > 8 * jnp.linalg.norm(ends[2] - ends[1])
+
+
+def test_the_integer_one_is_an_elastic_impact():
+    built = [ej.Scene(bar(contacts.Restitution(*x))).build() for x in ((), (1,), (1.0,))]
+    one, default, number = built
+    assert jax.tree.structure(one) == jax.tree.structure(default)
+    assert jax.tree.structure(one) != jax.tree.structure(number)
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [

@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .._operators import AbstractModel, make_model, Time
 from .._programs import compiled, is_known, raising
@@ -25,6 +25,10 @@ _ITERATIONS_OF_ATTEMPT = 30
 _ITERATIONS_WITHOUT_SPRINGS = 8
 # Springs that are softer than this fraction of the first ones are removed.
 _SOFTEST = 1e-6
+# The scale of forces is their size at the guess plus this fraction of the forces that stiff
+# parts would have in a pose as far away as the coordinates are large. The machine epsilon
+# times these is round-off, which no iteration removes.
+_OF_STIFF_FORCES = 1e-3
 # Load steps are divided down to this fraction of those that the user asked for.
 _SHORTEST_STEP = 1e-2
 
@@ -192,7 +196,7 @@ def _solve(
     at_guess = jnp.zeros_like(unit)
 
     def balance(x, inputs):
-        model, unit, size, anchor, stiffness = inputs
+        model, unit, size, row, anchor, stiffness = inputs
         shift, scaled_multipliers = x
         q = q0 + model.displacement(q0, unit * shift)
         constraint, transpose = _constraint_near(model, q, guess.t, at_guess)
@@ -200,21 +204,27 @@ def _solve(
         force = slope + transpose(size * scaled_multipliers / scales.constraint)[0]
         rows = size * scales.constraint + scales.constraint_size
         force = force / (size * scales.step) + stiffness * (shift - anchor)
-        return force, constraint / rows
+        return force / row, constraint / rows
 
     # The balance has more rows than there are multipliers: these come closest to it.
     _, transpose = _constraint_near(model, q0, guess.t, at_guess)
     rows = jax.vmap(transpose)(jnp.diag(1 / scales.constraint))[0] / scales.step[None]
     slope = model.slope(guess) / scales.step
     scaled_multipliers = jnp.linalg.lstsq(rows.T, -slope)[0] / size
-    first = at_guess, scaled_multipliers
-    inputs = model, unit, size
-    no_springs = at_guess, jnp.zeros_like(size)
+    first, no_springs = (at_guess, scaled_multipliers), (at_guess, jnp.zeros_like(size))
+    inputs, one = (model, unit, size), jnp.ones_like(size)
+    far = largest(q0 * scales.coordinate) / size
+    unscaled = lambda shift: balance((shift, first[1]), (*inputs, one, *no_springs))[0]
+    stiffness, force = _stiffness(unscaled, at_guess)
+    row = jax.lax.stop_gradient(1 + _OF_STIFF_FORCES * stiffness * far)
+    inputs = *inputs, row
     near, others = first, [first, first]
     if not is_near:
         with_springs = lambda x, springs: balance(x, (*inputs, *springs))
-        far = largest(q0 * scales.coordinate) / size
-        stiffness = _stiffness_above_potential(with_springs, first, far)
+        # Above the stiffness of the potential, except that of very stiff parts: springs as
+        # stiff would have to be softened too often.
+        stiffness = 16 * (stiffness / row + force / (far + 1e-3))
+        stiffness = jnp.where(stiffness > 0, stiffness, 1)
         near, others = _descend(with_springs, root_finder, first, stiffness), []
     root = find_root(
         balance,
@@ -278,22 +288,13 @@ def _descend(
     return jax.tree.map(lambda new, old: jnp.where(done, new, old), x, guess)
 
 
-def _stiffness_above_potential(
-    balance: Callable[[Any, tuple[Array, Scalar]], Any],
-    guess: tuple[Array, Array],
-    far: Scalar,
-) -> Scalar:
-    """A stiffness above that of the potential, which is estimated at the guess.
-
-    `far` is the largest scaled coordinate.
-    """
-    no_springs = jnp.zeros_like(guess[0]), jnp.zeros_like(far)
-    along = jnp.cos(jnp.arange(guess[0].size, dtype=far.dtype))
-    (force, _), (change, _) = jax.jvp(
-        lambda x: balance((x, guess[1]), no_springs), (guess[0],), (along,)
-    )
-    stiffness = largest(change) + largest(force) / (far + 1e-3)
-    return jnp.where(stiffness > 0, 16 * stiffness, 1)
+def _stiffness(
+    force: Callable[[Array], Array], guess: Float[Array, " nu"]
+) -> tuple[Scalar, Scalar]:
+    """The size of the stiffness of the potential, and that of the forces, at the guess."""
+    along = jnp.cos(jnp.arange(guess.size, dtype=guess.dtype))
+    at_guess, change = jax.jvp(force, (guess,), (along,))
+    return largest(change), largest(at_guess)
 
 
 def _force_size(model: AbstractModel, guess: State) -> Scalar:

@@ -26,18 +26,20 @@ from .._types import Args, Real, Scalar
 from ..schemes import AbstractScheme, AbstractSchemeWithRotations
 from .discrete_gradient_check import check_derivatives
 from .experience import Experience, experience_of
+from .start_check import with_checked_rates
 
 
 class Prepared(NamedTuple):
     """The checked arguments of a run.
 
-    - `start`, `args`: the start, and `args` as arrays.
+    - `system`, `start`, `args`: with arrays as numbers, and checked derivatives.
     - `h`, `t`: the length of a step and the time of the start in the dtype of the start;
       those that the user gives as numbers of Python or NumPy are NumPy's.
     - `experience`: what earlier calls have shown of the system.
     - `is_checked`: whether the values were known, and have been checked.
     """
 
+    system: AbstractSystem
     start: State
     args: Args
     h: Scalar
@@ -96,7 +98,8 @@ def prepare(
     if is_known((scheme, system, start, args)):
         check_derivatives(scheme, system, start, args, experience)
     at = as_array(t, step.dtype)
-    return Prepared(start, args, step, at, experience, is_checked)
+    system, args = with_checked_rates(system, scheme, start, args, step)
+    return Prepared(system, start, args, step, at, experience, is_checked)
 
 
 def positive_integer(name: str, count: Any) -> int:

@@ -22,7 +22,6 @@ from .loop import run_loop
 from .saving import check_saveat, RecordedRun, SaveAt, saving_of, with_events
 from .solution import first_rows, Solution
 from .stage import is_chord_alone
-from .start_check import with_checked_rates
 from .step_sizes import AbstractController, EqualSteps, find_end
 from .task import Task
 from .watcher import watcher_of
@@ -140,8 +139,7 @@ def simulate(
     check_halvings(max_halvings)
     options = checked_options(progress, checkpoint, checkpoint_seconds, resume)
     prepared = prepare(system, scheme, start, args, h, t0, root_finder)
-    start, args, step, begin, experience, is_checked = prepared
-    system, args = with_checked_rates(system, scheme, start, args, step)
+    system, start, args, step, begin, experience, is_checked = prepared
     end = find_end(num_steps, t1, max_steps, controller, h, t0, step.dtype)
     plan = controller.plan(scheme, step, begin, end)
     longest = plan.max_attempts if options is None else sys.maxsize

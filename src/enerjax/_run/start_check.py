@@ -108,6 +108,8 @@ def _factors(
     - `moving`, `others`: the numbers with a rate, and all else, of a system and `args`.
     - `of_rates`: whether the velocities do not move either.
     """
+    if not jax.tree.leaves(moving):
+        return moving
     moving, still = eqx.partition(moving, _occur_in_constraints(moving, others, start))
     if not jax.tree.leaves(moving):
         return moving

@@ -23,7 +23,6 @@ from .model import model_for
 from .prediction import Memory
 from .reverse import scan
 from .stage import first_memory
-from .start_check import with_checked_rates
 
 
 class Warm(eqx.Module):
@@ -207,8 +206,8 @@ def step(
     **Raises:** `ValueError` or `TypeError` for wrong shapes, types and signs, and for a
     system with events.
     """
-    state, args, h, *_ = prepare(system, scheme, state, args, h, t, root_finder)
-    system, args = with_checked_rates(system, scheme, state, args, h)
+    prepared = prepare(system, scheme, state, args, h, t, root_finder)
+    system, state, args, h, *_ = prepared
     check_halvings(max_halvings)
     if system.events:
         raise ValueError(

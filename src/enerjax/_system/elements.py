@@ -164,6 +164,9 @@ class Elements(AbstractStrainEnergy):
             for (part, fn), own in zip(self._of_strains, strains, strict=True)
         )
 
+    def angles(self, q, args=None):
+        return q[:0]
+
     @property
     def _of_strains(self) -> "list[tuple[Elements, _OfStrains]]":
         parts = ((part, part.fn) for part in self.parts)

@@ -33,9 +33,9 @@ class AbstractStrainEnergy(eqx.Module):
     def stresses(self, strains: StrainArrays, args: Args = None) -> StrainArrays:
         """`K Gamma` (energy per strain), linear in the strains."""
 
+    @abc.abstractmethod
     def angles(self, q: Coordinates, args: Args = None) -> Float[Array, " angles"]:
         """Angles between minus and plus half a turn, where the energy is not smooth.
 
-        A step in which one of them passes half a turn fails. By default there are none.
+        A step in which one of them passes half a turn fails.
         """
-        return q[:0]

@@ -107,7 +107,8 @@ def explain(
     **Raises:** `ValueError` or `TypeError` for bad input, as `simulate` does.
     """
     length = 1.0 if h is None else h
-    start, args, step, *_ = prepare(system, scheme, start, args, length, 0.0, root_finder)
+    prepared = prepare(system, scheme, start, args, length, 0.0, root_finder)
+    system, start, args, step, *_ = prepared
     found: list[Explanation] = []
 
     # Everything is found while this function is traced.

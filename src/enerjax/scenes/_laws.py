@@ -332,13 +332,14 @@ def _compression(gap: Scalar, numbers: Numbers, exponent: Scalar) -> Scalar:
 
 @dataclass(frozen=True)
 class Penalized(AbstractSpringLaw):
-    """The energy of a spring that acts where a gap is negative, with a damper."""
+    """The energy of a spring that acts where a gap is negative; it may have a damper."""
 
     measure: AbstractMeasure
+    is_damped: bool
 
     @property
-    def damper(self) -> "AbstractForceLaw":
-        return CompressionDamper(self.measure)
+    def damper(self) -> "AbstractForceLaw | None":
+        return CompressionDamper(self.measure) if self.is_damped else None
 
     def energy(self, value: Array, numbers: Numbers) -> Scalar:
         exponent = numbers["exponent"] + 1

@@ -21,8 +21,8 @@ class Restitution(eqx.Module):
     """An exact impact: the rate of the gap is multiplied by `-coefficient`; see `Impact`.
 
     `coefficient` is a number from 0 to 1, and a number of the part, `args.set("floor",
-    restitution=0.7)`. Without one the impact is elastic: no energy is lost, no gap stays
-    closed, and the program is smaller.
+    restitution=0.7)`. Without one, or with the integer 1, the impact is elastic: no energy
+    is lost, no gap stays closed, and the program is smaller.
     """
 
     coefficient: Real | None = None
@@ -32,9 +32,10 @@ class Penalty(eqx.Module):
     """A force that grows with the penetration `d = -gap`, for a motion without jumps.
 
     It is `stiffness d^exponent (1 + damping ddot)`: Hertz's law for spheres with the
-    exponent 3/2, and Hunt and Crossley's damper. The spring has a potential, so with
-    `damping` zero energy is conserved like that of other springs. `stiffness` is a force
-    per length^exponent, `exponent` at least one, and `damping` a time per length.
+    exponent 3/2, and Hunt and Crossley's damper. The spring has a potential, so without
+    `damping` energy is conserved like that of other springs, and `Composed` can be used.
+    `stiffness` is a force per length^exponent, `exponent` at least one, and `damping` a
+    time per length, which must be given here if it is to be changed in `args`.
 
     **Reference:** K. H. Hunt and F. R. E. Crossley, Coefficient of restitution interpreted
     as damping in vibroimpact, J. Appl. Mech. 42 (1975) 440-445.
@@ -42,7 +43,7 @@ class Penalty(eqx.Module):
 
     stiffness: Real
     exponent: Real = 1.5
-    damping: Real = 0.0
+    damping: Real | None = None
 
 
 class AbstractContact(AbstractPart):
@@ -59,16 +60,20 @@ def _resolved(
             f"`ej.contacts.Penalty(...)`, got {law!r}."
         )
     if isinstance(law, Restitution):
-        if law.coefficient is None:
+        is_one = isinstance(law.coefficient, int) and law.coefficient == 1
+        if law.coefficient is None or is_one:
             return Gap(gap, is_elastic=True), numbers
         e = number(ends.part, "`coefficient`", law.coefficient, (), least=0.0)
         number(ends.part, "1 - `coefficient`", 1 - e, (), least=0.0)
         return Gap(gap, is_elastic=False), numbers | dict(restitution=e)
-    return Penalized(gap), numbers | dict(
+    numbers |= dict(
         stiffness=positive(ends.part, "`stiffness`", law.stiffness),
         exponent=number(ends.part, "`exponent`", law.exponent, (), least=1.0),
-        damping=number(ends.part, "`damping`", law.damping, (), least=0.0),
     )
+    if law.damping is None:
+        return Penalized(gap, is_damped=False), numbers
+    damping = number(ends.part, "`damping`", law.damping, (), least=0.0)
+    return Penalized(gap, is_damped=True), numbers | dict(damping=damping)
 
 
 def _radius(ends: Ends, role: str, radius: Real) -> Numbers:
