@@ -1,7 +1,7 @@
 """The numbers of a scene, which are accessed by name and stored kind by kind."""
 
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NoReturn
 
 import equinox as eqx
@@ -17,9 +17,9 @@ from ._layout import Layout
 class Parameters(eqx.Module):
     """All numbers of a scene: the `args` of its system.
 
-    They are read as `args["bodies"]["crank"]["mass"]`, `args["joints"]["pin"]["point_b"]`,
-    `args["forces"]["spring"]["stiffness"]` or `args["gravity"]`, and those that you passed
-    to the scene as `args` by their own names. `set` returns a copy with other values, and
+    They are read like a dictionary: `args["bodies"]["crank"]["mass"]`,
+    `args["joints"]["pin"]["point_b"]`, `args["forces"]["spring"]["stiffness"]` or
+    `args["gravity"]`, and those that you passed to the scene as `args` by their own names. `set` returns a copy with other values, and
     `args | {"k": 2.0}` one with other numbers of your own, as for a dictionary. The
     leaves of this pytree are tables with one row for each part of a kind, so that a hundred
     rods need no larger program than one. Gradients are read by name too.
@@ -29,8 +29,20 @@ class Parameters(eqx.Module):
     own: dict[str, Any]
     layout: Layout = eqx.field(static=True)
 
+    def keys(self) -> tuple[str, ...]:
+        """The names of the sections, and of your own numbers."""
+        return (*self.own, *self.tables)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.keys())
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.keys()
+
     def __getitem__(self, key: str) -> Any:
-        return _Section(self, key) if key in self.tables else self.own[key]
+        if key in self.tables:
+            return _Section(self, key)
+        return _entry(self.own, key, self)
 
     def __setitem__(self, key: str, value: Any) -> NoReturn:
         _refuse(key)
@@ -86,6 +98,13 @@ def _like(old: Mapping[str, Any], key: str, value: Any) -> Any:
     return new
 
 
+def _entry(entries: Mapping[str, Any], key: str, names: Iterable[str]) -> Any:
+    """The entry with this name, with an error that tells all names."""
+    if key not in entries:
+        raise KeyError(f"There is no '{key}'; there are {sorted(names)}.")
+    return entries[key]
+
+
 class _ReadOnly(Mapping):
     """A mapping that explains `Parameters.set` when it is assigned to."""
 
@@ -121,7 +140,7 @@ class _Section(_ReadOnly):
         self._entries = parameters.layout.places[section]
 
     def __getitem__(self, name: str) -> "_Part":
-        group, row = self._entries[name]
+        group, row = _entry(self._entries, name, self)
         return _Part(jax.tree.map(lambda table: table[row], self._tables[group]))
 
     def __repr__(self) -> str:
@@ -137,7 +156,7 @@ class _Part(_ReadOnly):
         self._entries = numbers
 
     def __getitem__(self, name: str) -> Any:
-        return self._entries[name]
+        return _entry(self._entries, name, self)
 
     def __repr__(self) -> str:
         return ", ".join(f"{name} = {_text(x)}" for name, x in self.items())

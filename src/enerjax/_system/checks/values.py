@@ -233,11 +233,24 @@ def check_values(system: AbstractSystem, state: State, args: Args) -> bool:
     return True
 
 
+def _not_finite(args: Any, name: str) -> list[str]:
+    """The numbers of `args` that are not finite, as `name = value`."""
+    if hasattr(args, "keys"):
+        found = [_not_finite(args[key], f"{name}[{key!r}]") for key in args.keys()]
+        return [text for texts in found for text in texts]
+    leaves = jax.tree_util.tree_leaves_with_path(args)
+    return [
+        f"`{name}{jax.tree_util.keystr(path)}` = {x}"
+        for path, x in leaves
+        if eqx.is_inexact_array(x) and not np.all(np.isfinite(x))
+    ]
+
+
 def _messages_of_start(potential: str | None, state: State, args: Args) -> dict[str, str]:
     """The messages about the start, forces, potential and constraints."""
     return {
         "start": f"The start is not finite: q = {state.q}, v = {state.v}.",
-        "args": f"`args` holds a number that is not finite: {args}.",
+        "args": f"Not finite: {', '.join(_not_finite(args, 'args'))}.",
         "potential": (
             f"{potential} is not finite at the start, q = {state.q}. Is it defined there?"
         ),
