@@ -19,10 +19,10 @@ class Parameters(eqx.Module):
 
     They are read like a dictionary: `args["bodies"]["crank"]["mass"]`,
     `args["joints"]["pin"]["point_b"]`, `args["forces"]["spring"]["stiffness"]` or
-    `args["gravity"]`, and those that you passed to the scene as `args` by their own names. `set` returns a copy with other values, and
-    `args | {"k": 2.0}` one with other numbers of your own, as for a dictionary. The
-    leaves of this pytree are tables with one row for each part of a kind, so that a hundred
-    rods need no larger program than one. Gradients are read by name too.
+    `args["gravity"]`, and those that you passed to the scene as `args` by their own names.
+    `set` returns a copy with other values, and `args | {"k": 2.0}` one with other numbers
+    of your own. The leaves of this pytree are tables with one row for each part of a kind,
+    so that a hundred rods need no larger program than one. Gradients are read by name too.
     """
 
     tables: dict[str, tuple[Numbers, ...]]
