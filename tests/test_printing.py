@@ -72,6 +72,18 @@ def test_a_run_prints_outcome_steps_iterations_and_audit():
     assert "steps divided, into up to" in divided
 
 
+def test_a_run_that_an_event_ends_prints_when():
+    system = ej.System(jnp.eye(1), lambda q, args: q[0])
+    start = ej.State(jnp.array([1.0]), jnp.array([0.0]))
+    ground = ej.Event(lambda q, v, t, args: q[0], terminal=True)
+    text = str(
+        ej.simulate(
+            system, ej.EnergyPreserving(), start, h=0.1, num_steps=20, events=ground
+        )
+    )
+    assert "an event ended the run at t = 1.41421, behind the last row" in text
+
+
 def test_a_batch_prints_the_number_of_lanes_with_each_outcome():
     problem = ej.problems.pendulum()
     batch = jax.vmap(lambda h: run(problem, h))(jnp.array([0.01, 0.02, 50.0]))

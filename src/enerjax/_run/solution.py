@@ -246,6 +246,17 @@ def _first_rows_moved(tree: PyTree[Array]) -> PyTree[Array]:
     return tree
 
 
+def _report_of_end(solution: Solution) -> list[str]:
+    """A line about a run that an event has ended before its last row."""
+    kinetic, events = np.asarray(solution.audit.kinetic), solution.events
+    if events is None or kinetic.ndim > 1 or solution.result != RESULTS.successful:
+        return []
+    if events.count == 0 or not kinetic.size or np.isfinite(kinetic[-1]):
+        return []
+    t = np.asarray(events.ts)[int(events.count) - 1]
+    return [f"an event ended the run at t = {t:.6g}, behind the last row that was reached"]
+
+
 def _report(solution: Solution) -> str:
     stats = solution.stats
     done, times = np.asarray(stats.completed_steps), np.asarray(solution.ts)
@@ -259,7 +270,7 @@ def _report(solution: Solution) -> str:
         outcome = f"{done.size} lanes: {outcome}"
         steps = f"{done.min()} to {done.max()}"
     rows = f"rows from t = {np.nanmin(times):.6g} to {np.nanmax(times):.6g}"
-    lines = [outcome, f"{steps} steps, {rows}"]
+    lines = [outcome, f"{steps} steps, {rows}", *_report_of_end(solution)]
     if np.sum(done) > 0:
         lines.append(f"{np.sum(iterations) / np.sum(done):.1f} iterations a step")
     if np.any(halvings > 0):
