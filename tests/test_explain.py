@@ -124,6 +124,21 @@ def test_a_sparse_solver_replaces_the_chord_method():
     assert by_klu.jacobian.endswith("entries, KLU")
 
 
+@pytest.mark.parametrize(("restitution", "rests"), [(None, False), (0.8, True)])
+def test_steps_that_look_for_impacts_are_one_function(restitution, rests):
+    law = ej.contacts.Restitution(restitution)
+    parts = [
+        ej.bodies.PlanarBody("rod", 1.0, 1 / 12, [0.0, 1.0], 0.3),
+        ej.contacts.OnPlane("floor", "ground", "rod", [0, 1], law, point_b=[0.5, 0]),
+    ]
+    system, start, args = ej.Scene(parts, gravity=[0.0, -9.81]).build()
+    top = ej.Event(lambda q, v, t, args: v[1])
+    text = str(ej.explain(system, ej.EnergyPreserving(), start, args, events=top))
+    assert "events: 2 functions" in text
+    assert ("gaps that can stay closed" in text) == rests
+    assert "one function of machine code: yes" in text
+
+
 def test_bad_input_is_refused_as_in_a_run():
     with pytest.raises(TypeError, match="scheme"):
         explained("double", ej.EnergyPreserving)

@@ -410,6 +410,27 @@ def test_entries_at_known_places(places, operation):
     assert names & {"slice", "gather"} == {operation} - {"no operation"}
 
 
+@pytest.mark.parametrize("kind", ["add", "subtract", "multiply", "min", "max", "divide"])
+@pytest.mark.parametrize(
+    "places",
+    [np.array([1, 2, 4, 0]), np.array([0, 3, 3, 5]), np.zeros(4, int), slice(1, 5)],
+    ids=["once", "twice", "often", "slice"],
+)
+def test_updates_that_join_what_is_at_a_place(kind, places):
+    x = jnp.cos(jnp.arange(18.0)).reshape(6, 3)
+    fn = lambda x, updates: getattr(x.at[places], kind)(updates) * x
+    assert not why_not_one_function(fn, x, x[2:] + 3)
+    found, expected = (f(x, x[2:] + 3) for f in (jax.jit(in_one_function(fn)), fn))
+    np.testing.assert_allclose(found, expected, rtol=1e-15)
+    # At a place that is computed, of integers.
+    whole = lambda x, place: getattr(x.at[place], kind)(x[1])
+    if kind != "divide":
+        x = jnp.arange(18).reshape(6, 3) % 7
+        assert not why_not_one_function(whole, x, jnp.array(4))
+        found = jax.jit(in_one_function(whole))(x, jnp.array(4))
+        np.testing.assert_array_equal(found, whole(x, jnp.array(4)))
+
+
 def test_known_places_stay_known():
     """JAX counts negative places from the end, which many updates must not compute."""
     places = jnp.asarray(np.arange(150)[::-1])

@@ -158,7 +158,7 @@ class Impacts(eqx.Module):
         assert isinstance(rows, _WithGaps)
         first = rows.first_row(q, model.args)
         gaps = slice(first, first + len(self.impacts))
-        return multipliers.at[gaps].multiply(rows.resting)
+        return multipliers.at[gaps].set(rows.resting * multipliers[gaps])
 
     def without_gaps(self, model: AbstractModel, q: Coordinates, rows: Array) -> Array:
         """Rows of the constraints, without those of the gaps."""

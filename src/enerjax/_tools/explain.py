@@ -1,6 +1,7 @@
 """What a step of a system computes, in words: to find out why it is slow."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 
 from .._operators import AbstractModel, Increment, SeparableModel
 from .._programs import num_operations, simplified, why_not_one_function
+from .._run.events import AbstractEvent
 from .._run.inputs import prepare
 from .._run.loop import dispensable_newton, Stepper
 from .._run.model import model_for
@@ -18,11 +20,16 @@ from .._run.stage import (
     step_problem,
 )
 from .._run.step_sizes import End, EqualSteps
+from .._run.watcher import Watcher, watcher_of
 from .._run.without_jacobian import contraction, CONTRACTS
 from .._solvers import ChordAlone, flattened, linearisable, Newton, RootFinder, SMALL
 from .._system import AbstractSystem, State
 from .._types import Args, Real, Scalar
 from ..schemes import AbstractScheme
+
+
+# As in a run that does not say otherwise.
+_MAX_EVENTS = 64
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,6 +53,7 @@ class Explanation:
       with the places where they are called; empty if it is one function.
     - `operations`: the number of scalar operations of an evaluation of the step equations,
       of which a correction needs one.
+    - `events`: what a step looks for besides; `None` without events.
     """
 
     coordinates: str
@@ -57,6 +65,7 @@ class Explanation:
     jacobian: str
     obstacles: tuple[str, ...]
     operations: int
+    events: str | None
 
     def __str__(self) -> str:
         parts = ", ".join(f"{count} {name}" for name, count in self.unknowns.items())
@@ -67,6 +76,7 @@ class Explanation:
             f"method: {self.method}",
             *([] if self.chord is None else [f"matrix of the constraints: {self.chord}"]),
             *([] if self.contraction is None else [self._omitted(self.contraction)]),
+            *([] if self.events is None else [f"events: {self.events}"]),
             f"exact Jacobian: {self.jacobian}",
             f"step equations: about {self.operations} scalar operations",
         ]
@@ -92,6 +102,7 @@ def explain(
     *,
     h: Real | None = None,
     root_finder: RootFinder = Newton(),
+    events: AbstractEvent | Sequence[AbstractEvent] = (),
 ) -> Explanation:
     """What a step of a system by a scheme computes, without computing it.
 
@@ -99,8 +110,9 @@ def explain(
     the step is one function of machine code, or because of which operations it is not. A
     step that is not one function takes several times as long if the system is small.
 
-    **Arguments:** as for `simulate`. With the length `h` of a step (time) it also tells
-    whether the forces are so stiff that the chord method is of no use.
+    **Arguments:** as for `simulate`; events of the system count too. With the length `h` of
+    a step (time) it also tells whether the forces are so stiff that the chord method is of
+    no use.
 
     **Returns:** an `Explanation`; `print` it.
 
@@ -110,11 +122,15 @@ def explain(
     prepared = prepare(system, scheme, start, args, length, 0.0, root_finder)
     system, start, args, step, *_ = prepared
     found: list[Explanation] = []
+    watcher = watcher_of(system, events, _MAX_EVENTS, scheme, False)
+    if watcher is not None:
+        system = watcher.system(system, start.q.dtype)
 
     # Everything is found while this function is traced.
     def traced(start: State, args: Args, h: Scalar) -> Scalar:
         model = model_for(scheme, system, start, args)
-        found.append(_explained(scheme, model, model.to_internal(start), h, root_finder))
+        internal = model.to_internal(start)
+        found.append(_explained(scheme, model, internal, h, root_finder, watcher))
         return h
 
     jax.eval_shape(traced, start, args, step)
@@ -130,13 +146,16 @@ def _explained(
     start: State,
     h: Scalar,
     root_finder: RootFinder,
+    watcher: Watcher | None,
 ) -> Explanation:
     plan = EqualSteps().plan(scheme, h, jnp.zeros_like(h), End(num_steps=1))
-    dispensable = dispensable_newton(root_finder, scheme, plan, None)
+    if watcher is not None:
+        plan = plan.with_events(watcher.max_attempts)
+    dispensable = dispensable_newton(root_finder, scheme, plan, watcher)
     search = root_finder
     if dispensable is not None:
         search = ChordAlone(dispensable)
-    stepper = Stepper(scheme, model, plan, search, None)
+    stepper = Stepper(scheme, model, plan, search, None, watcher)
     begin = stepper.begin(start)
     memory = jax.tree.map(lambda x: x[0], begin.warm.stages)
     by_chord = is_chord_alone(search, scheme.stage, model)
@@ -170,6 +189,7 @@ def _explained(
         operations=num_operations(
             simplified(lambda x: equations(x, (scheme.stage, problem))), flat
         ),
+        events=None if watcher is None else _events(watcher),
     )
 
 
@@ -194,6 +214,13 @@ def _chord(model: AbstractModel) -> str | None:
         return model.elastic_tables.description
     tables = model.constraint_tables
     return None if tables is None else tables.description
+
+
+def _events(watcher: Watcher) -> str:
+    count = len(watcher.events)
+    told = f"{count} function{'s' * (count > 1)}, whose zeros are searched for in each step"
+    rests = "; gaps that can stay closed are rows of redundant constraints"
+    return told + rests * watcher.can_rest
 
 
 _NAMES = {

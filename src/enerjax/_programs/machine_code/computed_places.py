@@ -204,22 +204,37 @@ def _filling(params: Any, dtype: str) -> Number:
 
 def scatter(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
     operand, index, updates = values
-    dtype, adds = dtype_of(operand), eqn.primitive.name == "scatter-add"
-    if not adds and not _replaces(eqn.params.get("update_jaxpr")):
+    dtype, join = dtype_of(operand), JOINS[eqn.primitive.name]
+    if eqn.primitive.name == "scatter-sub":
+        minus = lambda x: self.graph.multiply(dtype, -1, x)
+        updates = self.map(minus, [updates], updates.shape, dtype)
+    if join is None and not _replaces(eqn.params.get("update_jaxpr")):
         raise Unsupported("a function of what is at a place")
     size, count = math.prod(operand.shape), math.prod(updates.shape)
     if count == 0:
         return [operand]
     if not isinstance(index, np.ndarray):
-        return [_scattered_to_computed(self, eqn, values)]
+        return [_scattered_to_computed(self, eqn, operand, index, updates)]
     places = _places_of_updates(operand.shape, index, updates.shape, eqn.params)
-    if not adds:
+    if join is None:
         source, falls = np.arange(size), places >= 0
         source[places[falls]] = size + np.flatnonzero(falls)
         firsts = np.array([0, size, size + count])
         numbers = source.reshape(operand.shape)
         return [self.taken([operand, updates], firsts, numbers, dtype)]
-    return [_added(self, operand, updates, places, dtype)]
+    return [_joined(self, join, operand, updates, places, dtype)]
+
+
+# The operation of each kind of scatter between what is at a place and an update; `None` for
+# the kind that writes updates. A difference is the sum with minus the update.
+JOINS = {
+    "scatter": None,
+    "scatter-add": "add",
+    "scatter-sub": "add",
+    "scatter-mul": "mul",
+    "scatter-min": "min",
+    "scatter-max": "max",
+}
 
 
 def _replaces(update: Any) -> bool:
@@ -260,8 +275,8 @@ def _places_of_updates(
 _FEW_PLACES, _PASSES = 8, (2, 8)
 
 
-def _added(self: "Evaluation", operand, updates, places, dtype) -> Value:
-    """Updates added to known places."""
+def _joined(self: "Evaluation", join: str, operand, updates, places, dtype) -> Value:
+    """Updates added to the numbers at known places, or joined by another operation."""
     size, count = math.prod(operand.shape), math.prod(updates.shape)
     if size == 0:
         return operand
@@ -269,7 +284,7 @@ def _added(self: "Evaluation", operand, updates, places, dtype) -> Value:
     order = order[places[order] >= 0]
     to = places[order]
     before = np.arange(to.size) - np.searchsorted(to, to)
-    zero = np.zeros((1,), dtype)
+    neutral = np.full((1,), _neutral(join, dtype), dtype)
     firsts = np.array([0, count, count + 1])
     # The few places with many updates, such as a body that many others are attached to, are
     # added up by themselves: passes over all places would be many.
@@ -280,38 +295,57 @@ def _added(self: "Evaluation", operand, updates, places, dtype) -> Value:
     if often.size:
         sums = []
         for place in often:
-            own = self.taken([updates, zero], firsts, order[to == place], dtype)
-            sums.append(self.reshaped(self.total("add", own, (0,)), (1,)))
-        sums.append(zero)
+            own = self.taken([updates, neutral], firsts, order[to == place], dtype)
+            sums.append(self.reshaped(self.total(join, own, (0,)), (1,)))
+        sums.append(neutral)
         total = self.move(jax.lax.concatenate_p, sums, dict(dimension=0))[0]
         numbers = np.full(size, often.size)
         numbers[often] = np.arange(often.size)
         spread = self.taken(
             [total], np.array([0, often.size + 1]), numbers.reshape(operand.shape), dtype
         )
-        out = _sum(self, out, spread, dtype)
+        out = _of_two(self, join, out, spread, dtype)
     before, to, order = (x[~is_often] for x in (before, to, order))
     for k in range(int(before.max(initial=-1)) + 1):
         numbers = np.full(size, count)
         numbers[to[before == k]] = order[before == k]
-        row = self.taken([updates, zero], firsts, numbers.reshape(operand.shape), dtype)
-        out = _sum(self, out, row, dtype)
+        row = self.taken([updates, neutral], firsts, numbers.reshape(operand.shape), dtype)
+        out = _of_two(self, join, out, row, dtype)
     return out
 
 
-def _sum(self: "Evaluation", a: Value, b: Value, dtype: str) -> Value:
-    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
-        return a + b
-    if isinstance(a, np.ndarray) and not np.any(a):
+def _neutral(join: str, dtype: str) -> Any:
+    """The number that an operation joins to any other without changing it."""
+    if join in ("add", "mul"):
+        return int(join == "mul")
+    if dtype[0] == "f":
+        return np.inf if join == "min" else -np.inf
+    if dtype[0] not in "iu":
+        raise Unsupported(f"a scatter of {dtype}")
+    return np.iinfo(dtype).max if join == "min" else np.iinfo(dtype).min
+
+
+def _of_two(self: "Evaluation", join: str, a: Value, b: Value, dtype: str) -> Value:
+    if join == "add" and isinstance(a, np.ndarray) and not np.any(a):
         return b
-    return self.map(lambda x, y: self.graph.add(dtype, x, y), [a, b], a.shape, dtype)
+    rule = lambda x, y: _joined_numbers(self, join, dtype, x, y)
+    return self.map(rule, [a, b], a.shape, dtype)
 
 
-def _scattered_to_computed(self: "Evaluation", eqn: Any, values: list[Value]) -> Value:
+def _joined_numbers(
+    self: "Evaluation", join: str, dtype: str, x: Number, y: Number
+) -> Number:
+    if join == "add":
+        return self.graph.add(dtype, x, y)
+    if join == "mul":
+        return self.graph.multiply(dtype, x, y)
+    return self.graph.op(join, dtype, (x, y))
+
+
+def _scattered_to_computed(self: "Evaluation", eqn: Any, operand, index, updates) -> Value:
     """Updates at computed places: every place asks whether an update is its own."""
-    operand, index, updates = values
     params, graph, dtype = eqn.params, self.graph, dtype_of(operand)
-    dims, adds = params["dimension_numbers"], eqn.primitive.name == "scatter-add"
+    dims, join = params["dimension_numbers"], JOINS[eqn.primitive.name]
     count, size = math.prod(index.shape[:-1]), math.prod(operand.shape)
     kept = [k for k in range(len(operand.shape)) if k not in dims.inserted_window_dims]
     window = [updates.shape[k] for k in dims.update_window_dims]
@@ -342,7 +376,8 @@ def _scattered_to_computed(self: "Evaluation", eqn: Any, values: list[Value]) ->
             on: Number = True
             for number, place in zip(numbers, places, strict=True):
                 on = graph.op("and", "b1", (on, graph.compare("eq", "i8", number, place)))
-            new = graph.add(dtype, old, new) if adds else new
+            if join is not None:
+                new = _joined_numbers(self, join, dtype, old, new)
             return graph.select(dtype, on, new, old)
 
         part = self.reshaped(self.subarray(turned, (slice(k, k + 1),)), tuple(whole))

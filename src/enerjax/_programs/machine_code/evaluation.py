@@ -15,7 +15,7 @@ from jax.extend.core import Literal, Var
 from ..jaxprs import programs_within, solution_program, wrapped_program
 from ..numpy_primitives import BY_NUMPY, evaluated, moved, MOVES
 from ..primitives import FACTORS, LINEAR_SOLVE
-from .computed_places import dynamic_slice, dynamic_update_slice, gather, scatter
+from .computed_places import dynamic_slice, dynamic_update_slice, gather, JOINS, scatter
 from .contraction import contraction
 from .dense import by_loops, can_be_loops
 from .elementwise import ELEMENTWISE
@@ -664,7 +664,7 @@ _RULES: dict[str, Callable[[Evaluation, Any, list[Value]], list[Value]]] = {
     **dict.fromkeys(_OPS, _reduction),
     **dict.fromkeys("cumsum cumprod cummax cummin".split(), _running),
     **dict.fromkeys(("argmax", "argmin"), _extreme_place),
-    **dict.fromkeys(("scatter", "scatter-add"), scatter),
+    **dict.fromkeys(JOINS, scatter),
     **dict.fromkeys(FACTORS, _factors),
     "dot_general": contraction,
     "dynamic_slice": dynamic_slice,
