@@ -51,6 +51,11 @@ BAD = BAD_FUNCTIONS | {
         "`potential`",
     ),
     "args not finite": (dict(args=ARGS | dict(g=np.inf)), ValueError, "`args` holds"),
+    "args not finite, by name": (
+        dict(args=ARGS | dict(g=np.inf)),
+        ValueError,
+        r"not finite: `args\['g'\]` = inf",
+    ),
     "args in single precision": (
         dict(args=ARGS | dict(g=np.array(9.81, np.float32))),
         TypeError,

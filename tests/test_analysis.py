@@ -103,6 +103,31 @@ def test_drives_stand_where_they_are_at_the_time():
     np.testing.assert_allclose(found.multipliers, [9.81 / 2, 0, -9.81], rtol=0, atol=1e-11)
 
 
+def test_a_stiff_beam_bends_in_proportion_to_small_loads():
+    """The round-off of its stiff forces is far above the smallest of these loads times the
+    machine epsilon."""
+    section = ej.Section.rectangle(0.02, 0.01, E=210e9, nu=0.3, rho=7850.0)
+    beam = ej.bodies.Beam("beam", [[0.0, 0.0], [1.0, 0.0]], section, 8)
+    clamp = ej.joints.Fixed("clamp", "ground", beam.start)
+    load = ej.forces.ConstantForce("load", beam.end, [0.0, 0.0])
+    scene = ej.Scene([beam, clamp, load])
+    system, start, args = scene.build()
+    stiffness = args["beams"]["beam"]
+
+    def deflection(force):
+        numbers = args.set("load", force=jnp.stack([0.0 * force, -force]))
+        pose = ej.equilibrium(system, start, numbers).state
+        return -scene.position(pose, beam.end)[1]
+
+    forces = jnp.array([0.01, 0.1, 1.0, 3.0])
+    flexibility = jax.vmap(deflection)(forces) / forces
+    # Truncation: large deflections change it by the square of the load.
+    np.testing.assert_allclose(flexibility, flexibility[0], rtol=1e-5)
+    # Truncation: Bernoulli's and Timoshenko's beam, by eight elements.
+    expected = 1 / (3 * stiffness["EI"]) + 1 / stiffness["GA"]
+    np.testing.assert_allclose(flexibility[0], expected, rtol=5e-3)
+
+
 def test_a_missing_equilibrium_raises_an_error():
     system, start, args = problem("particles")
     free = ej.System(system.kinetic, lambda q, args: q[1])

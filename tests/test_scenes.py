@@ -86,6 +86,13 @@ def test_numbers_are_found_and_set_by_name_and_differentiated():
     np.testing.assert_array_equal(heavier["gravity"], [0.0, -1.0])
     with pytest.raises(ValueError, match="There is no `g`"):
         _ = args | {"g": 1.0}
+    assert list(args)[: len(args.own)] == list(args.own)
+    assert dict(args).keys() == {**args}.keys() == set(args.keys())
+    assert "gravity" in args
+    assert "g" not in args
+    with pytest.raises(KeyError) as caught:
+        _ = args["bodies"]["nobody"]
+    assert "there are ['" in caught.value.__notes__[0]
 
 
 def constraint(scene):

@@ -354,6 +354,9 @@ class Watcher(eqx.Module):
 
         none = lambda state: Changed(state, varying, no_forces, zero, good)
         changed = jnp.any(happens & jnp.asarray(self.changes_state))
+        # The reverse pass computes an event again. What it would keep of the event would be
+        # kept in every step, also in those without one.
+        change = jax.checkpoint(change, prevent_cse=False)
         return jax.lax.cond(in_any_lane(changed), change, none, state)
 
     def _reset(

@@ -99,9 +99,11 @@ def _like(old: Mapping[str, Any], key: str, value: Any) -> Any:
 
 
 def _entry(entries: Mapping[str, Any], key: str, names: Iterable[str]) -> Any:
-    """The entry with this name, with an error that tells all names."""
+    """The entry with this name, with an error that tells the names of all."""
     if key not in entries:
-        raise KeyError(f"There is no '{key}'; there are {sorted(names)}.")
+        error = KeyError(key)
+        error.add_note(f"There is no '{key}'; there are {sorted(names)}.")
+        raise error
     return entries[key]
 
 

@@ -250,7 +250,10 @@ def _messages_of_start(potential: str | None, state: State, args: Args) -> dict[
     """The messages about the start, forces, potential and constraints."""
     return {
         "start": f"The start is not finite: q = {state.q}, v = {state.v}.",
-        "args": f"Not finite: {', '.join(_not_finite(args, 'args'))}.",
+        "args": (
+            "`args` holds a number that is not finite: "
+            f"{', '.join(_not_finite(args, 'args'))}."
+        ),
         "potential": (
             f"{potential} is not finite at the start, q = {state.q}. Is it defined there?"
         ),
