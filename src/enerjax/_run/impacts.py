@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._analysis import project_velocity
 from .._operators import AbstractModel
-from .._programs import is_known
+from .._programs import is_known, values_of
 from .._results import RESULTS
 from .._system import AbstractSystem, HamiltonianSystem, State
 from .._types import Args, Coordinates, Flag, Multipliers, Scalar, Velocities
@@ -249,9 +249,9 @@ class Impacts(eqx.Module):
         """Positions and velocities after the time `shift`, to first order."""
         if len(self.impacts) == 1:
             return state.q, state.v
-        inner = model if held is None else with_resting(model, held)
-        rates = inner.lift(state.q, state.v), inner.accelerations(state)[0]
-        qdot, vdot = jax.lax.stop_gradient(rates)
+        at: State
+        inner, at = values_of((model if held is None else with_resting(model, held), state))
+        qdot, vdot = inner.lift(at.q, at.v), inner.accelerations(at)[0]
         return state.q + shift * qdot, state.v + shift * vdot
 
     def _push(
@@ -293,6 +293,8 @@ class Impacts(eqx.Module):
         No force pulls, and every gap stays closed that is `touching` and would close again
         soon, as `rest` says. Gaps open before others close.
         """
+        # Which gaps stay closed has no derivative.
+        model, state, resting = values_of((model, state, resting))
         rounding = jnp.finfo(state.q.dtype).eps ** 0.5
         rate = self.rates(model, state)
 
@@ -310,7 +312,7 @@ class Impacts(eqx.Module):
 
         length = 2 * len(self.impacts) + 1
         resting, (forces, ended) = jax.lax.scan(improve, resting, None, length=length)
-        return jax.lax.stop_gradient(resting), forces[-1], ended[-1]
+        return resting, forces[-1], ended[-1]
 
 
 def _outcome(valid: Flag, resolved: Flag) -> RESULTS:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._operators import AbstractModel
-from .._programs import in_any_lane
+from .._programs import in_any_lane, values_of
 from .._results import RESULTS
 from .._system import AbstractSystem, State
 from .._types import Args, Coordinates, Flag, Scalar
@@ -175,13 +175,14 @@ class Watcher(eqx.Module):
         """What is known at the start of a run, what varies of the model there, and a
         failure if a gap is not open."""
         model, forces, opens = self._first_model(model, state, t)
-        closed = self.closed(model)
-        values = jnp.where(closed, forces, self._of_user(model, state, t))
-        values = jax.lax.stop_gradient(values)
-        slope = jax.lax.stop_gradient(self._slopes(model, state, t))
+        # What is watched has no derivative.
+        still, state, t = values_of((model, state, t))
+        closed = self.closed(still)
+        values = jnp.where(closed, forces, self._of_user(still, state, t))
+        slope = self._slopes(still, state, t)
         none = jnp.zeros((2, values.size), values.dtype)
         eps = jnp.finfo(values.dtype).eps
-        size = jnp.abs(h * slope) + self._term_sizes(model, state, t)
+        size = jnp.abs(h * slope) + self._term_sizes(still, state, t)
         at_zero = ~closed & (jnp.abs(values) <= ZERO * eps * size)
         watch = Watch(
             side=_sign(jnp.where(at_zero, slope, values)),
@@ -209,7 +210,7 @@ class Watcher(eqx.Module):
         of_state = lambda q, v: self._of_user(model, State(q, v, state.t), t)
         at, sizes = (state.q, state.v), (jnp.abs(state.q), jnp.abs(state.v))
         change = jax.jvp(of_state, at, sizes)[1]
-        return jax.lax.stop_gradient(jnp.where(jnp.isfinite(change), jnp.abs(change), 0))
+        return jnp.where(jnp.isfinite(change), jnp.abs(change), 0)
 
     def _first_model(
         self, model: AbstractModel, state: State, t: Scalar
@@ -406,8 +407,9 @@ class Watcher(eqx.Module):
     ) -> Watch:
         """What is known at the start of the next step, after an accepted one, and after the
         events that happen at its end."""
-        state = _timed(model, changed.state, t)
-        values = found.values
+        # What is watched has no derivative.
+        model, changed, found, t = values_of((model, changed, found, t))
+        state, values = _timed(model, changed.state, t), found.values
         if self.changes_state.any():
 
             def after() -> Float[Array, " events"]:
@@ -417,12 +419,11 @@ class Watcher(eqx.Module):
             happened = jnp.any(happens)
             new = jax.lax.cond(in_any_lane(happened), after, lambda: values)
             values = jnp.where(happened, new, values)
-        values = jax.lax.stop_gradient(values)
         closed = self.closed(model)
         sizes = watch.faded().sizes_with(values, closed)
         is_zero = ~closed & (happens | (jnp.abs(values) <= round_off(sizes, closed)))
         # From a zero a function moves to the side of its slope.
-        of_motion = lambda: jax.lax.stop_gradient(self._slopes(model, state, t))
+        of_motion = lambda: self._slopes(model, state, t)
         slopes = jax.lax.cond(
             in_any_lane(jnp.any(is_zero)), of_motion, lambda: jnp.zeros_like(values)
         )
