@@ -515,7 +515,7 @@ FAULTS = (
     Fault(
         "start: derivatives by velocities alone",
         "_run/start_check.py",
-        "_is_zero(motion.v))\n",
+        "not _is_moving(motion.v))\n",
         "False)\n",
         "A derivative by the amplitude of a drive is wrong, with a start that is held.",
         of("gradients::test_a_start_that_does_not_move_with_a_length_has_no_derivative"),
@@ -547,8 +547,8 @@ FAULTS = (
     Fault(
         "equilibrium: the round-off of stiff forces",
         "_analysis/equilibrium.py",
-        "1 + _OF_STIFF_FORCES * stiffness * far",
-        "1 + 0 * stiffness * far",
+        "1 + _OF_STIFF_FORCES * far * stiffness",
+        "1 + 0 * far * stiffness",
         "Balances of stiff beams under small loads are not found.",
         of("analysis::test_a_stiff_beam_bends_in_proportion_to_small_loads"),
     ),

@@ -464,7 +464,31 @@ def test_a_start_that_does_not_move_with_a_length_has_no_derivative(name):
             assert np.isfinite(of_one(args[key]))
     # In `jit` the values are not known before the program runs.
     found = jax.jit(jax.grad(last))(args)
-    assert {key for key, slope in found.items() if np.isnan(slope)} == wrong
+    assert {key for key, slope in found.items() if not np.isfinite(slope)} == wrong
+    found = jax.jit(jax.jacfwd(last))(args)
+    assert {key for key, slope in found.items() if not np.isfinite(slope)} == wrong
+
+
+def test_a_held_start_has_derivatives_by_other_numbers():
+    system, start = PENDULUM, ej.State(jnp.array([1.0, 0.0]), jnp.zeros(2))
+
+    def last(numbers, alpha=0.5):
+        g, l = numbers
+        args = dict(g=g, l=l, m=jnp.array(1.3))
+        scheme = ej.EnergyDecaying(alpha)
+        return ej.simulate(system, scheme, start, args, h=0.01, num_steps=5).ys.q[-1, 0]
+
+    numbers = jnp.array([9.81, 1.0])
+    alone = jax.grad(lambda g: last((g, 1.0)))(9.81)
+    # Numbers in one array, of which one has a derivative.
+    together = jax.grad(lambda g: last(jnp.stack([g, 1.0])))(9.81)
+    by_both = jax.grad(last)(numbers)
+    for found in (together, by_both[0]):
+        np.testing.assert_allclose(found, alone, rtol=1e-12)
+    assert not np.isfinite(by_both[1])
+    # The numbers of the scheme are traced too.
+    with pytest.raises(ValueError, match="no derivative with respect to"):
+        jax.grad(lambda l, alpha: last((9.81, l), alpha), (0, 1))(1.0, 0.5)
 
 
 def test_a_number_of_the_system_itself_is_named():

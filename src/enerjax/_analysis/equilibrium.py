@@ -25,10 +25,12 @@ _ITERATIONS_OF_ATTEMPT = 30
 _ITERATIONS_WITHOUT_SPRINGS = 8
 # Springs that are softer than this fraction of the first ones are removed.
 _SOFTEST = 1e-6
-# The scale of forces is their size at the guess plus this fraction of the forces that stiff
-# parts would have in a pose as far away as the coordinates are large. The machine epsilon
-# times these is round-off, which no iteration removes.
+# The scale of a force is the size of all forces at the guess plus this fraction of what its
+# stiffness would cause in a pose as far away as the coordinates are large. The machine
+# epsilon times the latter is round-off, which no iteration removes.
 _OF_STIFF_FORCES = 1e-3
+# So many times this round-off is accepted.
+_ROUND_OFF = 1e3
 # Load steps are divided down to this fraction of those that the user asked for.
 _SHORTEST_STEP = 1e-2
 
@@ -212,20 +214,19 @@ def _solve(
     slope = model.slope(guess) / scales.step
     scaled_multipliers = jnp.linalg.lstsq(rows.T, -slope)[0] / size
     first, no_springs = (at_guess, scaled_multipliers), (at_guess, jnp.zeros_like(size))
-    inputs, one = (model, unit, size), jnp.ones_like(size)
-    far = largest(q0 * scales.coordinate) / size
-    unscaled = lambda shift: balance((shift, first[1]), (*inputs, one, *no_springs))[0]
-    stiffness, force = _stiffness(unscaled, at_guess)
-    row = jax.lax.stop_gradient(1 + _OF_STIFF_FORCES * stiffness * far)
-    inputs = *inputs, row
+    far, one = largest(q0 * scales.coordinate) / size, jnp.ones_like(unit)
+    forces = lambda x: balance(x, (model, unit, size, one, *no_springs))[0]
+    stiffness = _stiffness(forces, first)
+    row = 1 + _OF_STIFF_FORCES * far * stiffness
+    inputs = model, unit, size, row
     near, others = first, [first, first]
     if not is_near:
         with_springs = lambda x, springs: balance(x, (*inputs, *springs))
         # Above the stiffness of the potential, except that of very stiff parts: springs as
         # stiff would have to be softened too often.
-        stiffness = 16 * (stiffness / row + force / (far + 1e-3))
-        stiffness = jnp.where(stiffness > 0, stiffness, 1)
-        near, others = _descend(with_springs, root_finder, first, stiffness), []
+        above = largest(stiffness) / largest(row) + largest(forces(first)) / (far + 1e-3)
+        above = jnp.where(above > 0, 16 * above, 1)
+        near, others = _descend(with_springs, root_finder, first, above), []
     root = find_root(
         balance,
         root_finder,
@@ -238,8 +239,9 @@ def _solve(
     q: Coordinates = q0 + model.displacement(q0, unit * shift)
     multipliers = size * scaled_multipliers / scales.constraint
     residual = largest(jnp.concatenate(balance(root.value, (*inputs, *no_springs))))
+    found = root.found & _is_balanced(forces, root.value, stiffness, far)
     state = State(q, jnp.zeros_like(model.to_user(guess).v))
-    return Equilibrium(state, model.user_multipliers(multipliers)), residual, root.found
+    return Equilibrium(state, model.user_multipliers(multipliers)), residual, found
 
 
 def _constraint_near(
@@ -289,12 +291,26 @@ def _descend(
 
 
 def _stiffness(
-    force: Callable[[Array], Array], guess: Float[Array, " nu"]
-) -> tuple[Scalar, Scalar]:
-    """The size of the stiffness of the potential, and that of the forces, at the guess."""
-    along = jnp.cos(jnp.arange(guess.size, dtype=guess.dtype))
-    at_guess, change = jax.jvp(force, (guess,), (along,))
-    return largest(change), largest(at_guess)
+    forces: Callable[[tuple[Array, Array]], Array], at: tuple[Array, Array]
+) -> Float[Array, " nu"]:
+    """The size of the stiffness of each force, from a change of all coordinates at once."""
+    shift, multipliers = jax.lax.stop_gradient(at)
+    along = jnp.cos(jnp.arange(shift.size, dtype=shift.dtype))
+    change = jax.jvp(lambda x: forces((x, multipliers)), (shift,), (along,))[1]
+    return jnp.abs(jax.lax.stop_gradient(change))
+
+
+def _is_balanced(
+    forces: Callable[[tuple[Array, Array]], Array],
+    at: tuple[Array, Array],
+    stiffness: Float[Array, " nu"],
+    far: Scalar,
+) -> Flag:
+    """Whether the forces vanish to half of the digits, or to their round-off."""
+    eps = jnp.finfo(far.dtype).eps
+    largest_stiffness = jnp.maximum(stiffness, _stiffness(forces, at))
+    allowed = eps**0.5 + _ROUND_OFF * eps * far * largest_stiffness
+    return jnp.all(jnp.abs(forces(at)) <= allowed)
 
 
 def _force_size(model: AbstractModel, guess: State) -> Scalar:

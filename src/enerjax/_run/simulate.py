@@ -59,8 +59,8 @@ def simulate(
     of the program. For derivatives with respect to the start, or to numbers in the
     constraints, such as lengths, create the start inside the differentiated function with
     `initial_state`, so that it stays on the constraints. With respect to a number in the
-    constraints with which the start does not move there is no derivative: this is an error,
-    and where values are traced, as in `jit` and `vmap`, that derivative is NaN.
+    constraints there is no derivative if the start does not move at all: it is infinite or
+    NaN, and an error if it is the only one and outside of `jit` and `vmap`.
 
     **Arguments:**
 

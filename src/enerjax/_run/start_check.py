@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from .._operators import AbstractModel
 from .._programs import compiled_for_once, is_known, jacobian_pattern, values_of
 from .._results import RESULTS
 from .._system import AbstractSystem, direction_without_symmetry, State
-from .._types import Args, Flag, Scalar
+from .._types import Args, Scalar
 from ..schemes import AbstractScheme
 from .model import model_for
 
@@ -59,40 +59,48 @@ def _errors(
 def with_checked_rates(
     system: AbstractSystem, scheme: AbstractScheme, start: State, args: Args, h: Scalar
 ) -> tuple[AbstractSystem, Args]:
-    """The system and `args`, with an error for derivatives that a run does not have.
+    """The system and `args`, without derivatives that a run does not have.
 
     The constraints may depend on a number with respect to which a derivative is taken, such
-    as a length. If the start does not move with it, the run with another length would be
-    refused. Where values are traced, as in `jit`, the derivative is NaN in place of the
-    error.
+    as a length. If the start does not move, the run with another length would be refused.
+    The derivatives by such numbers are infinite or NaN, and if there are no others, this is
+    an error. (Where values are traced, as in `jit`, there is no error.) A start that moves
+    with any number is not checked.
     """
-    is_traced = lambda x: eqx.is_inexact_array(x) and not is_known(x)
-    numbers, rest = eqx.partition((system, args), is_traced)
-    if not jax.tree.leaves(numbers):
+    everything = system, args, scheme, start, h
+    is_traced = lambda x: eqx.is_array(x) and not is_known(x)
+    traced, known = eqx.partition(everything, is_traced)
+    if not jax.tree.leaves(traced[:2]):
         return system, args
 
     @jax.custom_jvp
-    def checked(numbers: PyTree[Array], start: State, h: Scalar) -> PyTree[Array]:
-        del start, h
-        return numbers
+    def checked(traced: PyTree[Array]) -> PyTree[Array]:
+        return traced[:2]
 
     def rule(primals: Any, tangents: Any) -> tuple[PyTree[Array], PyTree[Array]]:
-        (numbers, start, h), (rates, motion, _) = primals, tangents
-        if not _is_zero(motion.q):
-            return numbers, rates
+        (traced,), (rates,) = primals, tangents
+        numbers, motion = rates[:2], rates[3]
+        if _is_moving(motion.q):
+            return traced[:2], numbers
         each = functools.partial(jax.tree.map, is_leaf=_is_zero)
-        moving, still = eqx.partition(numbers, each(lambda r: not _is_zero(r), rates))
-        others = eqx.combine(still, rest)
-        factors = _factors(scheme, moving, others, start, h, _is_zero(motion.v))
-        times = lambda rate, factor: rate if factor is None else rate * factor
-        return numbers, each(times, rates, factors)
+        moving, still = eqx.partition(traced[:2], each(_is_moving, numbers))
+        others = eqx.combine(still, known[:2])
+        _, _, scheme, start, h = eqx.combine(traced, known)
+        factors = _factors(scheme, moving, others, start, h, not _is_moving(motion.v))
+        # Two such products make a rate infinite, and leave a rate that is zero as it is.
+        times = lambda rate, factor: rate if factor is None else rate * factor * factor
+        return traced[:2], each(times, numbers, factors)
 
     checked.defjvp(rule, symbolic_zeros=True)
-    return eqx.combine(checked(numbers, start, h), rest)
+    return eqx.combine(checked(traced), known[:2])
 
 
 def _is_zero(rate: Any) -> bool:
     return isinstance(rate, SymbolicZero)
+
+
+def _is_moving(rate: Any) -> bool:
+    return rate is not None and not _is_zero(rate)
 
 
 def _factors(
@@ -102,24 +110,27 @@ def _factors(
     start: State,
     h: Scalar,
     of_rates: bool,
-) -> PyTree[Scalar]:
-    """For each moving number in the constraints NaN if the start must move with it, else 1.
+) -> PyTree[Array]:
+    """For each moving number in the constraints 1, or a large factor if the start must move
+    with it.
 
     - `moving`, `others`: the numbers with a rate, and all else, of a system and `args`.
     - `of_rates`: whether the velocities do not move either.
     """
     if not jax.tree.leaves(moving):
         return moving
-    moving, still = eqx.partition(moving, _occur_in_constraints(moving, others, start))
-    if not jax.tree.leaves(moving):
-        return moving
-    numbers = (scheme, moving, eqx.combine(still, others), start, h)
-    scheme, moving, others, start, h = values_of(numbers)
-    are_wrong = _violate(scheme, moving, others, start, h, of_rates)
-    for path, wrong in jax.tree_util.tree_leaves_with_path(are_wrong):
-        if is_known(wrong) and wrong:
-            raise ValueError(_message(path))
-    return jax.tree.map(lambda wrong: jnp.where(wrong, jnp.nan, 1), are_wrong)
+    inside, free = eqx.partition(moving, _occur_in_constraints(moving, others, start))
+    if not jax.tree.leaves(inside):
+        return inside
+    scheme, inside, others, start, h = values_of(
+        (scheme, inside, eqx.combine(free, others), start, h)
+    )
+    are_wrong = _violate(scheme, inside, others, start, h, of_rates)
+    wrong = jax.tree_util.tree_leaves_with_path(are_wrong)
+    if not jax.tree.leaves(free) and all(is_known(x) and x.all() for _, x in wrong):
+        raise ValueError(_message(wrong[0][0]))
+    large = jnp.finfo(h.dtype).max
+    return jax.tree.map(lambda wrong: jnp.where(wrong, large, 1).astype(h.dtype), are_wrong)
 
 
 def _occur_in_constraints(
@@ -156,7 +167,7 @@ def _violate(
     start: State,
     h: Scalar,
     of_rates: bool,
-) -> PyTree[Flag]:
+) -> PyTree[Bool[Array, "..."]]:
     """Whether another value of the numbers makes the start violate the constraints."""
 
     def errors(moving: PyTree[Array]) -> Array:
@@ -166,20 +177,21 @@ def _violate(
 
     value, pull_back = jax.vjp(errors, moving)
     (slopes,) = pull_back(direction_without_symmetry(value))
-    # The change of the errors if the number doubles.
-    change = lambda x, slope: jnp.where(x == 0, 1, x) * slope
-    return jax.tree.map(lambda x, s: jnp.any(jnp.abs(change(x, s)) > 1), moving, slopes)
+    # A number is changed by its own size, or by one if it is smaller.
+    violates = lambda x, slope: jnp.maximum(jnp.abs(x), 1) * jnp.abs(slope) > 1
+    return jax.tree.map(violates, moving, slopes)
 
 
 def _message(path: Any) -> str:
     """The error for a number of `(system, args)` at this place."""
     (root, *rest) = path
     name = "args" if root.idx else "system"
-    name += jax.tree_util.keystr(tuple(rest))
+    # The tables of a scene have rows for all parts of a kind.
+    is_table = root.idx and str(rest[0]) == ".tables"
+    name += f"[...]{rest[-1]}" if is_table else jax.tree_util.keystr(tuple(rest))
     return (
         f"This run has no derivative with respect to `{name}`: the constraints depend on "
         "it, and the start does not, so a run with another value would be refused. Create "
         "the start inside the differentiated function, with `initial_state(system, q, v, "
-        "args)`. If you do not need this derivative, pass "
-        f"`jax.lax.stop_gradient({name})`."
+        "args)`, or `scene.start(args)`."
     )

@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 from .._programs import at_places
 from .._system import AbstractStrainEnergy
@@ -71,12 +72,17 @@ class PotentialOfScene(AbstractStrainEnergy):
             and isinstance(group.law.measure, AbstractTurn)
         ]
         found = evaluate_all(in_space, View(self.layout, q))
-        # Without stiffness the energy is smooth.
         acting = [
-            jnp.where(numbers["stiffness"] == 0, 0, angles)
+            jnp.where(_acts(numbers), angles, 0)
             for (_, numbers), angles in zip(in_space, found, strict=True)
         ]
         return jnp.concatenate([q[:0], *acting])
+
+
+def _acts(numbers: Numbers) -> Bool[Array, " parts"]:
+    """Which springs have a stiffness; without one their energy is smooth."""
+    names = [x for x in ("stiffness", "quadratic", "cubic") if x in numbers]
+    return jnp.any(jnp.stack([numbers[x] != 0 for x in names]), axis=0)
 
 
 def _springs(layout: Layout, args: Parameters) -> list[tuple[Links, Elastic, Numbers]]:

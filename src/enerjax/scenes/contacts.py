@@ -60,7 +60,7 @@ def _resolved(
             f"`ej.contacts.Penalty(...)`, got {law!r}."
         )
     if isinstance(law, Restitution):
-        is_one = isinstance(law.coefficient, int) and law.coefficient == 1
+        is_one = type(law.coefficient) is int and law.coefficient == 1
         if law.coefficient is None or is_one:
             return Gap(gap, is_elastic=True), numbers
         e = number(ends.part, "`coefficient`", law.coefficient, (), least=0.0)

@@ -235,7 +235,7 @@ def check_values(system: AbstractSystem, state: State, args: Args) -> bool:
 
 def _not_finite(args: Any, name: str) -> list[str]:
     """The numbers of `args` that are not finite, as `name = value`."""
-    if hasattr(args, "keys"):
+    if callable(getattr(args, "keys", None)):
         found = [_not_finite(args[key], f"{name}[{key!r}]") for key in args.keys()]
         return [text for texts in found for text in texts]
     leaves = jax.tree_util.tree_leaves_with_path(args)
