@@ -32,7 +32,7 @@ from .start_check import with_checked_rates
 class Prepared(NamedTuple):
     """The checked arguments of a run.
 
-    - `system`, `start`, `args`: with arrays as numbers, and checked derivatives.
+    - `system`, `start`, `args`: their numbers are arrays with checked derivatives.
     - `h`, `t`: the length of a step and the time of the start in the dtype of the start;
       those that the user gives as numbers of Python or NumPy are NumPy's.
     - `experience`: what earlier calls have shown of the system.

@@ -202,6 +202,18 @@ def _filling(params: Any, dtype: str) -> Number:
     return int(np.iinfo(dtype).max) if dtype[0] == "u" else True
 
 
+# The operation of each kind of scatter between what is at a place and an update; `None` for
+# the kind that writes updates. A difference is the sum with minus the update.
+JOINS = {
+    "scatter": None,
+    "scatter-add": "add",
+    "scatter-sub": "add",
+    "scatter-mul": "mul",
+    "scatter-min": "min",
+    "scatter-max": "max",
+}
+
+
 def scatter(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
     operand, index, updates = values
     dtype, join = dtype_of(operand), JOINS[eqn.primitive.name]
@@ -222,19 +234,7 @@ def scatter(self: "Evaluation", eqn: Any, values: list[Value]) -> list[Value]:
         firsts = np.array([0, size, size + count])
         numbers = source.reshape(operand.shape)
         return [self.taken([operand, updates], firsts, numbers, dtype)]
-    return [_joined(self, join, operand, updates, places, dtype)]
-
-
-# The operation of each kind of scatter between what is at a place and an update; `None` for
-# the kind that writes updates. A difference is the sum with minus the update.
-JOINS = {
-    "scatter": None,
-    "scatter-add": "add",
-    "scatter-sub": "add",
-    "scatter-mul": "mul",
-    "scatter-min": "min",
-    "scatter-max": "max",
-}
+    return [_joined_at(self, join, operand, updates, places, dtype)]
 
 
 def _replaces(update: Any) -> bool:
@@ -275,7 +275,9 @@ def _places_of_updates(
 _FEW_PLACES, _PASSES = 8, (2, 8)
 
 
-def _joined(self: "Evaluation", join: str, operand, updates, places, dtype) -> Value:
+def _joined_at(
+    self: "Evaluation", join: str, operand, updates, places, dtype
+) -> Value:
     """Updates added to the numbers at known places, or joined by another operation."""
     size, count = math.prod(operand.shape), math.prod(updates.shape)
     if size == 0:
@@ -304,13 +306,13 @@ def _joined(self: "Evaluation", join: str, operand, updates, places, dtype) -> V
         spread = self.taken(
             [total], np.array([0, often.size + 1]), numbers.reshape(operand.shape), dtype
         )
-        out = _of_two(self, join, out, spread, dtype)
+        out = _joined_arrays(self, join, out, spread, dtype)
     before, to, order = (x[~is_often] for x in (before, to, order))
     for k in range(int(before.max(initial=-1)) + 1):
         numbers = np.full(size, count)
         numbers[to[before == k]] = order[before == k]
         row = self.taken([updates, neutral], firsts, numbers.reshape(operand.shape), dtype)
-        out = _of_two(self, join, out, row, dtype)
+        out = _joined_arrays(self, join, out, row, dtype)
     return out
 
 
@@ -325,7 +327,7 @@ def _neutral(join: str, dtype: str) -> Any:
     return np.iinfo(dtype).max if join == "min" else np.iinfo(dtype).min
 
 
-def _of_two(self: "Evaluation", join: str, a: Value, b: Value, dtype: str) -> Value:
+def _joined_arrays(self: "Evaluation", join: str, a: Value, b: Value, dtype: str) -> Value:
     if join == "add" and isinstance(a, np.ndarray) and not np.any(a):
         return b
     rule = lambda x, y: _joined_numbers(self, join, dtype, x, y)
