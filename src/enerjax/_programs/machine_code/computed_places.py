@@ -275,9 +275,7 @@ def _places_of_updates(
 _FEW_PLACES, _PASSES = 8, (2, 8)
 
 
-def _joined_at(
-    self: "Evaluation", join: str, operand, updates, places, dtype
-) -> Value:
+def _joined_at(self: "Evaluation", join: str, operand, updates, places, dtype) -> Value:
     """Updates added to the numbers at known places, or joined by another operation."""
     size, count = math.prod(operand.shape), math.prod(updates.shape)
     if size == 0:
