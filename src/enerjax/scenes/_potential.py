@@ -1,5 +1,7 @@
 """The potential energy of a scene, and its strains."""
 
+from typing import TypeVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -24,6 +26,9 @@ from ._pose_view import evaluate_all, View
 from ._user_functions import ask
 
 
+Law = TypeVar("Law", bound=AbstractSpringLaw)
+
+
 class PotentialOfScene(AbstractStrainEnergy):
     """The potential of a scene, whose `args` are `Parameters`.
 
@@ -37,7 +42,7 @@ class PotentialOfScene(AbstractStrainEnergy):
 
     def strains(self, q, args=None):
         view = View(self.layout, q)
-        springs = _springs(self.layout, args)
+        springs = _springs(self.layout, args, Elastic)
         measured = evaluate_all(
             [(group._replace(law=law.measure), own) for group, law, own in springs], view
         )
@@ -50,7 +55,7 @@ class PotentialOfScene(AbstractStrainEnergy):
         return (*of_springs, *of_beams)
 
     def stresses(self, strains, args=None):
-        tables = [numbers for _, _, numbers in _springs(self.layout, args)]
+        tables = [numbers for _, _, numbers in _springs(self.layout, args, Elastic)]
         count = len(tables)
         of_springs = [
             numbers["stiffness"] * own
@@ -64,12 +69,10 @@ class PotentialOfScene(AbstractStrainEnergy):
         return (*of_springs, *of_beams)
 
     def angles(self, q, args=None):
-        groups = zip(self.layout.force_groups, args.tables["forces"], strict=True)
         in_space = [
-            (group._replace(law=group.law.measure), numbers)
-            for group, numbers in groups
-            if isinstance(group.law, AbstractSpringLaw)
-            and isinstance(group.law.measure, AbstractTurn)
+            (group._replace(law=law.measure), numbers)
+            for group, law, numbers in _springs(self.layout, args, AbstractSpringLaw)
+            if isinstance(law.measure, AbstractTurn)
         ]
         found = evaluate_all(in_space, View(self.layout, q))
         acting = [
@@ -85,13 +88,15 @@ def _acts(numbers: Numbers) -> Bool[Array, " parts"]:
     return jnp.any(jnp.stack([numbers[x] != 0 for x in names]), axis=0)
 
 
-def _springs(layout: Layout, args: Parameters) -> list[tuple[Links, Elastic, Numbers]]:
-    """All groups of linear springs, with their laws and numbers."""
+def _springs(
+    layout: Layout, args: Parameters, kind: type[Law]
+) -> list[tuple[Links, Law, Numbers]]:
+    """All groups of springs of a kind, with their laws and numbers."""
     groups = zip(layout.force_groups, args.tables["forces"], strict=True)
     return [
         (group, group.law, numbers)
         for group, numbers in groups
-        if isinstance(group.law, Elastic)
+        if isinstance(group.law, kind)
     ]
 
 
