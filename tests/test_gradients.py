@@ -11,7 +11,7 @@ import enerjax as ej
 from enerjax._operators import make_model
 from enerjax._programs.jaxprs import programs_within
 from enerjax._run import reverse as reverse_pass
-from enerjax._solvers import root
+from enerjax._solvers import equations, root
 
 from .helpers import long, problem, SCHEMES
 
@@ -348,12 +348,15 @@ def test_a_derivative_traces_the_search_and_its_rule_once(monkeypatch):
     JAX would derive the loop twice, and trace the search in each of its programs."""
     calls = []
 
-    def counted(name):
-        fn = getattr(root, name)
-        monkeypatch.setattr(root, name, lambda *args: calls.append(name) or fn(*args))
+    def counted(owner, name):
+        fn = getattr(owner, name)
+        counting = lambda *args, **kwargs: calls.append(name) or fn(*args, **kwargs)
+        monkeypatch.setattr(owner, name, counting)
 
-    counted("search")
-    counted("with_jacobian")
+    counted(root, "search")
+    counted(root.Equations, "linearisable")
+    counted(equations, "form_of")
+    counted(equations, "_jacobian")
     system, start, args = ej.problems.double_pendulum()
 
     def end(h):
@@ -361,7 +364,10 @@ def test_a_derivative_traces_the_search_and_its_rule_once(monkeypatch):
         return run.ys.q[-1, 0]
 
     jax.jit(jax.grad(end)).trace(0.01)
-    assert sorted(calls) == ["search", "with_jacobian"]
+    # The search and the rule both need the Jacobian: its form is searched for once, and its
+    # program is traced once.
+    once = ["_jacobian", "form_of", "search"]
+    assert sorted(calls) == sorted([*once, "linearisable", "linearisable"])
 
 
 def first_multipliers(p):

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from .._operators import AbstractModel
-from .._programs import in_any_lane
+from .._programs import call_traced_once, in_any_lane
 from .._results import RESULTS
 from .._solvers import ChordAlone, RootFinder, SMALL
 from .._system import State
@@ -100,6 +100,14 @@ def solve_or_divide(
     return _solve_or_divide(step, max_halvings, asked_for)
 
 
+def _solved_once(step: _Step) -> Solved:
+    """The step or part, solved by a program that is traced once for all of them.
+
+    The loop over attempts contains it, and so do the derivatives.
+    """
+    return call_traced_once(_Step.solve, step)
+
+
 class _Attempts(eqx.Module):
     """The carry of the loop over attempts.
 
@@ -129,7 +137,7 @@ def _solve_or_divide(
     def attempt(before: _Attempts) -> _Attempts:
         count = (1 << before.halvings).astype(step.h.dtype)
         k = before.k.astype(step.h.dtype)
-        new = step.part(before.sofar, k, count, step.skip).solve()
+        new = _solved_once(step.part(before.sofar, k, count, step.skip))
         sofar = _joined(before.sofar, new, count)
         failed = (new.result != RESULTS.successful) & ~step.skip
         divides = failed & (before.halvings < max_halvings)
@@ -165,7 +173,7 @@ def _solve_or_divide_jvp(primals: Any, tangents: Any) -> Any:
 
     def in_parts(step: _Step) -> tuple[Solved, Count]:
         if not asked_for:
-            return step.solve(), jnp.array(0)
+            return _solved_once(step), jnp.array(0)
         return _solve_and_divide(step, max_halvings)
 
     return eqx.filter_jvp(in_parts, (step,), (t_step,))
@@ -173,7 +181,7 @@ def _solve_or_divide_jvp(primals: Any, tangents: Any) -> Any:
 
 def _solve_and_divide(step: _Step, max_halvings: int) -> tuple[Solved, Count]:
     """`_solve_or_divide` as a program that can be differentiated in reverse mode."""
-    whole = step.solve()
+    whole = _solved_once(step)
 
     def halve(carry: tuple[Solved, Count], times: Count):
         before, halvings = carry

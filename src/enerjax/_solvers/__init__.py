@@ -31,8 +31,9 @@ from .linear.independent_blocks import (
 )
 from .linear.jacobian import (
     affine_root as affine_root,
+    form_of as form_of,
     kept_factors as kept_factors,
-    linearisable as linearisable,
+    regularised as regularised,
     RowPattern as RowPattern,
 )
 from .linear.norms import largest as largest
@@ -53,7 +54,6 @@ from .newton_iterations import max_norm as max_norm
 from .root import find_root as find_root, ROOT as ROOT
 from .root_finding import (
     Chord as Chord,
-    flattened as flattened,
     Root as Root,
     RootFinder as RootFinder,
 )

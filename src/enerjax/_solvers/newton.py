@@ -8,7 +8,6 @@ from jaxtyping import Array, PyTree
 from .._programs import is_known
 from .._types import Flag, Scalar
 from .linear.dense import AbstractFactors
-from .linear.elimination_order import Owners
 from .linear.user_solver import AbstractSparseSolver
 
 
@@ -108,10 +107,6 @@ class Start(eqx.Module):
     - `by_chord`: whether to try the chord method first, where the equations have one.
     - `regularisation`: the numbers added to the diagonal of a Jacobian that may be
       singular, one for each unknown; see `find_root`.
-    - `owners`: a number for each unknown, negative for multipliers, in the order of
-      `ravel_pytree`; `None` where nothing is known. See `Owners`.
-    - `rarely`: whether Jacobians are needed rarely, so that a program is chosen that
-      compiles quickly.
     - `least`: the scaled size below which unknowns are round-off. Corrections are measured
       relative to the largest unknown, but to no less than this.
     """
@@ -123,5 +118,3 @@ class Start(eqx.Module):
     by_chord: Flag
     regularisation: PyTree[Array] | None
     least: Scalar
-    owners: Owners | None = eqx.field(static=True, default=None)
-    rarely: bool = eqx.field(static=True, default=False)

@@ -17,20 +17,19 @@ from jaxtyping import Array, Float, PyTree
 
 from .._programs import call_traced_once, in_one_function, is_known, part, simplified
 from .._types import Flag, Scalar
-from .linear.dense import AbstractFactors
+from .equations import Equations
+from .linear.dense import AbstractFactors, SMALL
 from .linear.elimination_order import Owners
 from .linear.jacobian import Linearisable
 from .linear.krylov import jacobian_solver
-from .newton import ChordAlone, Start
+from .newton import ChordAlone, Newton, Start
 from .root_finding import (
     Chord,
     flat_of,
-    flattened,
     has_chord_search,
     Root,
     RootFinder,
     search,
-    with_jacobian,
 )
 
 
@@ -39,18 +38,18 @@ ROOT = "enerjax_root"
 
 
 @eqx.filter_custom_jvp
-def _root(fn, chord, root_finder, args, start, max_iterations):
+def _root(equations, chord, root_finder, args, start, max_iterations):
     # A derivative of a loop over steps comes here several times.
     numbers = args, start, max_iterations
-    return call_traced_once(search, fn, chord, root_finder, *numbers)
+    return call_traced_once(search, equations, chord, root_finder, *numbers)
 
 
 @_root.def_jvp
 def _root_jvp(primals, tangents):
-    fn, chord, root_finder, args, start, max_iterations = primals
+    equations, chord, root_finder, args, start, max_iterations = primals
     t_args = tangents[3]
     # The search is compiled as a function of its own, because it is not differentiated.
-    again = lambda: _root(fn, chord, root_finder, args, start, max_iterations)
+    again = lambda: _root(equations, chord, root_finder, args, start, max_iterations)
     root = in_one_function(again)()
     # The derivatives of a step use these results of the search, and no others: with one
     # that is not kept, the reverse pass would search again.
@@ -65,16 +64,17 @@ def _root_jvp(primals, tangents):
     # What is not a root may be infinite. Its rates do not count, and must not be NaN: the
     # reverse pass would multiply them by zero.
     value = jax.tree.map(lambda x: jnp.where(root.found, x, 0), root.value)
-    flat, unravel, flat_fn = flattened(fn, value)
-    by_args = lambda moved: flat_fn(flat, eqx.combine(moved, fixed))
+    flat, unravel = ravel_pytree(value)
+    by_args = lambda moved: equations.flat(flat, eqx.combine(moved, fixed))
     # Programs without a chord method have no parts, and can be longer as one function.
     by_args = by_args if chord is None else part(by_args)
     _, rate = jax.jvp(by_args, (moved,), (t_args,))
     regularisation = flat_of(args[-1])
-    exact = with_jacobian(flat_fn, flat, args, root_finder, regularisation, start, chord)
+    exact = equations.linearisable(flat, args, regularisation)
     if regularisation is not None:
         solve = exact.regularised_solver(flat)
-        turned = _null_space_rate(exact, solve, flat_fn, flat, (moved, fixed), t_args)
+        inputs = equations.flat, flat, (moved, fixed), t_args
+        turned = _null_space_rate(exact, solve, *inputs)
         change = exact.refined(solve, -rate) + turned
     elif chord is not None and has_chord_search(root_finder):
         change = _change(exact, chord, root_finder, value, args, -rate)
@@ -185,8 +185,6 @@ def find_root(
         by_chord=jnp.asarray(by_chord),
         regularisation=regularisation,
         least=jnp.asarray(least, flat.dtype),
-        owners=owners,
-        rarely=rarely,
     )
     start = jax.lax.stop_gradient(start)
     traced, opened = _explicit_closure(fn, guess, args)
@@ -201,8 +199,17 @@ def find_root(
             lambda y, inputs, prepared: effective(y, inputs[1], prepared),
             chord.is_elastic,
         )
+    equations = Equations(
+        call,
+        guess,
+        root_finder.linear_solver if isinstance(root_finder, Newton) else None,
+        owners=owners,
+        rarely=rarely,
+        # With a chord even small Jacobians are searched for structure.
+        small=SMALL if chord is None else 0,
+    )
     inputs = traced, args, of_chord, regularisation
-    return _root(call, chord, root_finder, inputs, start, max_iterations)
+    return _root(equations, chord, root_finder, inputs, start, max_iterations)
 
 
 def _explicit_closure(fn: Callable, *like: Any) -> tuple[Any, Callable]:

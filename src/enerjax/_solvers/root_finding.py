@@ -14,8 +14,9 @@ from typing_extensions import TypeAliasType
 from .._programs import part
 from .._types import Count, Flag, Scalar
 from .chord_iterations import chord_iterations, PATIENCE, PATIENCE_ALONE
-from .linear.dense import AbstractFactors, Inverse, SMALL
-from .linear.jacobian import Linearisable, linearisable
+from .equations import Equations
+from .linear.dense import AbstractFactors, Inverse
+from .linear.jacobian import Linearisable
 from .newton import ChordAlone, Newton, Start
 from .newton_iterations import max_norm, newton_iterations, powers_of
 
@@ -66,39 +67,8 @@ class Root(eqx.Module):
     by_chord: Flag
 
 
-def flattened(fn: Callable, value: PyTree[Array]) -> tuple[Array, Callable, Callable]:
-    """`value` as a vector, the inverse of that map, and `fn` as a function of vectors."""
-    flat, unravel = ravel_pytree(value)
-    return flat, unravel, lambda x, args: ravel_pytree(fn(unravel(x), args))[0]
-
-
 def flat_of(regularisation: PyTree[Array] | None) -> Array | None:
     return None if regularisation is None else ravel_pytree(regularisation)[0]
-
-
-def with_jacobian(
-    fn: Callable[[Array, Any], Array],
-    like: Float[Array, " n"],
-    args: Any,
-    root_finder: RootFinder | ChordAlone,
-    regularisation: Float[Array, " n"] | None,
-    start: Start,
-    chord: Chord | None,
-) -> Linearisable:
-    """The equations with their exact Jacobian, for a search and for derivatives of a root.
-
-    With a chord even small Jacobians are searched for structure.
-    """
-    return linearisable(
-        fn,
-        like,
-        args,
-        root_finder.linear_solver if isinstance(root_finder, Newton) else None,
-        regularisation,
-        owners=start.owners,
-        rarely=start.rarely,
-        small=SMALL if chord is None else 0,
-    )
 
 
 def has_chord_search(root_finder: RootFinder | ChordAlone) -> bool:
@@ -112,7 +82,7 @@ def has_chord_search(root_finder: RootFinder | ChordAlone) -> bool:
 
 
 def search(
-    fn: Callable[[PyTree[Array], Any], PyTree[Array]],
+    equations: Equations,
     chord: Chord | None,
     root_finder: RootFinder | ChordAlone,
     args: PyTree,
@@ -122,11 +92,12 @@ def search(
     if isinstance(root_finder, ChordAlone):
         if chord is not None:
             newton = root_finder.newton
-            return _by_chord(fn, chord, newton, args, start, PATIENCE_ALONE)
+            return _by_chord(equations.fn, chord, newton, args, start, PATIENCE_ALONE)
         root_finder = root_finder.newton
     if not isinstance(root_finder, Newton):
+        fn, guess = equations.fn, start.guess
         solution = optx.root_find(
-            fn, root_finder, start.guess, args, max_steps=max_iterations, throw=False
+            fn, root_finder, guess, args, max_steps=max_iterations, throw=False
         )
         found, singular, nonfinite = (
             solution.result == getattr(optx.RESULTS, name)
@@ -146,12 +117,11 @@ def search(
             finite=jnp.isfinite(residual),
             by_chord=jnp.array(False),
         )
-    flat, _, flat_fn = flattened(fn, start.guess)
-    regularisation = flat_of(start.regularisation)
-    exact = with_jacobian(flat_fn, flat, args, root_finder, regularisation, start, chord)
+    flat, _ = ravel_pytree(start.guess)
+    exact = equations.linearisable(flat, args, flat_of(start.regularisation))
     if chord is None or not has_chord_search(root_finder):
         return _iterated(exact, root_finder, start, max_iterations)
-    first = _by_chord(fn, chord, root_finder, args, start, PATIENCE)
+    first = _by_chord(equations.fn, chord, root_finder, args, start, PATIENCE)
 
     def again() -> Root:
         # Under `vmap` this is evaluated for all lanes, also for those with a root.

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
 from .._operators import AbstractModel, Increment, SeparableModel
 from .._programs import num_operations, simplified, why_not_one_function
@@ -22,7 +23,7 @@ from .._run.stage import (
 from .._run.step_sizes import End, EqualSteps
 from .._run.watcher import Watcher, watcher_of
 from .._run.without_jacobian import contraction, CONTRACTS
-from .._solvers import ChordAlone, flattened, linearisable, Newton, RootFinder, SMALL
+from .._solvers import ChordAlone, form_of, Newton, regularised, RootFinder, SMALL
 from .._system import AbstractSystem, State
 from .._types import Args, Real, Scalar
 from ..schemes import AbstractScheme
@@ -162,19 +163,18 @@ def _explained(
     step = lambda progress: stepper.attempt(progress, jnp.array(True))
     problem = step_problem(scheme.stage, model, start, h, memory.carried)
     z = free_flight(scheme.stage, problem, model, start)
-    flat, _, equations = flattened(_equations, z)
+    flat, unravel = ravel_pytree(z)
+    equations = lambda x: ravel_pytree(scheme.stage.residual(unravel(x), problem))[0]
     jacobian = f"as {type(root_finder).__name__} chooses"
     if isinstance(root_finder, Newton):
         redundant = jnp.ones_like(flat) if model.system.redundant else None
-        form = linearisable(
-            equations,
+        form = form_of(
+            regularised(equations, redundant),
             flat,
-            (scheme.stage, problem),
             root_finder.linear_solver,
-            redundant,
             owners=owners_of(z, model.num_joints),
             small=0 if by_chord else SMALL,
-        ).form
+        )
         jacobian = form.description(flat.size)
     newton = "Newton's method" if isinstance(root_finder, Newton) else jacobian
     return Explanation(
@@ -186,20 +186,13 @@ def _explained(
         contraction=None,
         jacobian=jacobian,
         obstacles=why_not_one_function(step, begin),
-        operations=num_operations(
-            simplified(lambda x: equations(x, (scheme.stage, problem))), flat
-        ),
+        operations=num_operations(simplified(equations), flat),
         events=None if watcher is None else _events(watcher),
     )
 
 
 _CHORD = "chord method"
 _BY_CHORD = _CHORD + ", without the exact Jacobian; if that fails in a step, {}"
-
-
-def _equations(z: Any, args: Any) -> Any:
-    stage, problem = args
-    return stage.residual(z, problem)
 
 
 def _coordinates(model: AbstractModel, start: State) -> str:

@@ -1,7 +1,7 @@
 """Functions with their Jacobians, which are stored as their size and sparsity suggest."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import scipy
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from ..._programs import (
     columns_in_turn,
@@ -74,12 +74,18 @@ class Dense:
         return LineaxFactors(self.solver, jnp.zeros((size, size), dtype))
 
 
+# How a Jacobian is stored and solved with.
+Form: TypeAlias = Dense | BlockElimination | Sparse
+
+
 class Linearisable(eqx.Module):
     """A function from vectors to vectors, and linear algebra with its Jacobian.
 
-    It is constructed by `linearisable` at trace time.
+    It is constructed at trace time.
 
     - `value`: the function.
+    - `jacobian`: its Jacobian at a vector, with the regularisation, as
+      `AbstractFactors.renewed` takes it.
     - `form`: how the Jacobian is stored and solved with: as a dense array, in blocks, or as
       the list of entries that a user's sparse solver receives.
     - `regularisation`: numbers that are added to the diagonal of a Jacobian that may be
@@ -87,7 +93,8 @@ class Linearisable(eqx.Module):
     """
 
     value: Callable[[Float[Array, " n"]], Float[Array, " n"]]
-    form: Dense | BlockElimination | Sparse
+    jacobian: Callable[[Float[Array, " n"]], Array]
+    form: Form
     regularisation: Float[Array, " n"] | None
 
     @property
@@ -99,14 +106,6 @@ class Linearisable(eqx.Module):
     def keeps_factors(self) -> bool:
         """Whether the next search can begin with the factors of this one."""
         return self.is_dense
-
-    def jacobian(self, x: Float[Array, " n"]) -> Array:
-        """The Jacobian, with the regularisation, as `AbstractFactors.renewed` takes it."""
-        regularisation = self.regularisation
-        value = self.value
-        if regularisation is None:
-            return self.form.evaluate(value, x)
-        return self.form.evaluate(lambda x: value(x) + regularisation * x, x)
 
     def first_factors(
         self, kept: AbstractFactors | None, x: Float[Array, " n"]
@@ -191,45 +190,44 @@ class Linearisable(eqx.Module):
         return factors.solve, lambda right: jax.vjp(factors.solve, right)[1](right)[0]
 
 
-def linearisable(
-    fn: Callable[[Array, PyTree], Array],
+def regularised(
+    value: Callable[[Array], Array], regularisation: Float[Array, " n"] | None
+) -> Callable[[Array], Array]:
+    """The function whose Jacobian is that of `value` with the regularisation."""
+    if regularisation is None:
+        return value
+    return lambda x: value(x) + regularisation * x
+
+
+def form_of(
+    fn: Callable[[Array], Array],
     like: Float[Array, " n"],
-    args: Any,
     linear_solver: lx.AbstractLinearSolver | AbstractSparseSolver | None = None,
-    regularisation: Float[Array, " n"] | None = None,
     *,
     owners: Owners | None = None,
     rarely: bool = False,
     small: int = SMALL,
-) -> Linearisable:
-    """`fn(x, args)` as a function of `x`. All traced values must be passed in `args`.
+) -> Form:
+    """How the Jacobian of `fn` is stored and solved with.
 
-    By default the size and the sparsity of the Jacobian determine the linear solver. The
-    `regularisation` is added to the diagonal of a Jacobian that may be singular. If the
-    Jacobian is needed `rarely`, its program is one that compiles quickly. Structure is
-    searched for where there are more unknowns than `small`. `owners` tells coordinates from
-    multipliers; without it, SuperLU solves large equations.
+    By default its size and its sparsity decide. If it is needed `rarely`, its program is
+    one that compiles quickly. Structure is searched for where there are more unknowns than
+    `small`. `owners` tells coordinates from multipliers; without it, SuperLU solves large
+    equations.
     """
-    value = lambda x: fn(x, args)
     if isinstance(linear_solver, lx.AbstractLinearSolver):
-        return Linearisable(value, Dense(linear_solver), regularisation)
-    regularised = (
-        value if regularisation is None else lambda x: value(x) + regularisation * x
-    )
+        return Dense(linear_solver)
     if linear_solver is not None:
-        pattern = jacobian_pattern(regularised, like)
-        form = Sparse(linear_solver, pattern, like.size)
-        return Linearisable(value, form, regularisation)
-    pattern = jacobian_pattern(regularised, like) if like.size > small else None
+        return Sparse(linear_solver, jacobian_pattern(fn, like), like.size)
+    pattern = jacobian_pattern(fn, like) if like.size > small else None
     if pattern is None:
-        return Linearisable(value, Dense(None, rarely=rarely), regularisation)
-    form = Dense(None, pattern, rarely)
+        return Dense(None, rarely=rarely)
     if owners is not None:
         blocks = BlockElimination(pattern, owners, rarely)
-        form = blocks if blocks.is_cheaper_than_dense() else form
-    elif like.size > _MANY:
-        form = Sparse(SuperLU(), pattern, like.size)
-    return Linearisable(value, form, regularisation)
+        return blocks if blocks.is_cheaper_than_dense() else Dense(None, pattern, rarely)
+    if like.size > _MANY:
+        return Sparse(SuperLU(), pattern, like.size)
+    return Dense(None, pattern, rarely)
 
 
 def affine_root(
@@ -242,10 +240,10 @@ def affine_root(
     The linear part may be singular if there is a `regularisation`, which is added to its
     diagonal.
     """
-    at = jnp.zeros_like(like)
-    linear = linearisable(
-        lambda x, _: fn(x), at, None, regularisation=regularisation, rarely=True
-    )
+    at, added = jnp.zeros_like(like), regularised(fn, regularisation)
+    form = form_of(added, at, rarely=True)
+    jacobian = lambda x: form.evaluate(added, x)
+    linear = Linearisable(fn, jacobian, form, regularisation)
     if linear.is_dense and regularisation is None:
         return -jnp.linalg.solve(linear.jacobian(at), linear.value(at))
     return -linear.solve(at, linear.value(at))
