@@ -29,6 +29,7 @@ def across(u, v):
     return u[0] * v[1] - u[1] * v[0]
 
 
+PAIRS = np.array([[2, 5], [5, 2]])
 # Functions of two bodies `(x, y, angle)` that do not change when both turn together.
 INVARIANTS = dict(
     points=lambda q: jnp.sum((q[3:5] - q[:2] + axes(q[5])[0] - axes(q[2])[1]) ** 2),
@@ -40,6 +41,9 @@ INVARIANTS = dict(
     turned_round=lambda q: jnp.cosh(0.3 - q[2] + q[5]) * (-(0.5 * q[2]) + q[5] / 2),
     halves=lambda q: jnp.sum(axes(0.5 * q[2] + 0.5 * q[5])[1] * (q[3:5] - q[:2])),
     tables=lambda q: jnp.sum(jnp.diff(q.reshape(2, 3)[:, 2]) ** 2),
+    indices=lambda q: jnp.sum((q[np.array([5, 2])] - q[np.array([2, 5])]) ** 3),
+    lanes=lambda q: jnp.sum(jax.vmap(lambda x: jnp.cosh(x[0] - x[1]))(q[PAIRS])),
+    elements=lambda q: ej.Elements(lambda x, k, _: (x[1] - x[0]) ** 4, PAIRS)(q, None),
 )
 # Others, for which the rule is right but turns nothing together.
 OTHERS = dict(

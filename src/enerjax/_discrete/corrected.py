@@ -1,7 +1,7 @@
 """Discrete gradients that correct a mean gradient along the increment.
 
 Both forms are `g + c W d` with `d = b - a`, a mean gradient `g`, the weights `W` of the
-entries (one, unless they have different units), and the scalar `c` that makes the
+entries (in a step their inertia), and the scalar `c` that makes the
 directionality exact:
 
     c = (fn(b) - fn(a) - g . d) / (d . W d)
@@ -19,6 +19,7 @@ numerator is round-off at any `d`.
 """
 
 import abc
+import functools
 from collections.abc import Callable, Iterable
 
 import equinox as eqx
@@ -90,6 +91,7 @@ class AbstractCorrected(AbstractDerivative):
         select: Callable[[Coordinates], Float[Array, "rows width"]],
         a: Coordinates,
         b: Coordinates,
+        weights: Coordinates,
     ) -> Float[Array, "rows width"]:
         """The discrete gradient of each row of `fn`, in the coordinates that it depends on.
 
@@ -97,8 +99,8 @@ class AbstractCorrected(AbstractDerivative):
         to them. A correction of each row couples only coordinates that `fn` couples.
         """
         mean = self._mean(gradients, a, b)
-        correct = jax.vmap(lambda *ends: _corrected(*ends, weights=1.0, size=0.0))
-        return correct(fn(a), fn(b), select(a), select(b), mean)
+        correct = jax.vmap(functools.partial(_corrected, size=0.0))
+        return correct(fn(a), fn(b), select(a), select(b), mean, select(weights))
 
 
 class Gonzalez(AbstractCorrected):

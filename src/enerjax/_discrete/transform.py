@@ -29,9 +29,11 @@ from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array
 
 from .._programs import (
+    computed_indices,
     evaluate,
     function_with_own_derivative,
     interpret,
+    is_index,
     name_of,
     programs_within,
     wrapped_program,
@@ -60,6 +62,9 @@ class Switching(NamedTuple):
     squares: Array
     decided: Array
 
+
+# Larger tables of indices are not computed while the program is traced.
+_MANY = 4096
 
 Value: TypeAlias = Any  # an array, a Moving or a Switching
 Rule: TypeAlias = Callable[[list[Value], dict[str, Any]], list[Value]]
@@ -104,13 +109,16 @@ class Walk:
 
     def open(self, jaxpr: Any, consts: list[Value], inputs: list[Value]) -> list[Value]:
         """The outputs of a program for inputs that may differ between the two points."""
-        constants = [c if moves(c) else jnp.asarray(c) for c in consts]
+        constants = [c if moves(c) or is_index(c) else jnp.asarray(c) for c in consts]
         return interpret(jaxpr, constants, inputs, self._equation)
 
     def _equation(self, equation: Any, values: list[Value]) -> list[Value]:
         primitive, params = equation.primitive, equation.params
         if not any(moves(value) for value in values):
-            return evaluate(primitive, values, params)
+            # A trace makes numbers that are not known of those that it computes. Indices
+            # stay known: they tell which entries are angles.
+            indices = computed_indices(equation, values, _MANY)
+            return evaluate(primitive, values, params) if indices is None else indices
         rule = self._rules.get(name_of(equation))
         inner = wrapped_program(equation)
         if rule is None and inner is not None and self._is_smooth(equation, inner[0]):

@@ -62,6 +62,7 @@ def gradient_and_work_by_rows(
     driven: Callable[[Coordinates, Time], Scalar] | None,
     a: tuple[Coordinates, Time],
     b: tuple[Coordinates, Time],
+    weights: Coordinates,
 ) -> tuple[Coordinates, Scalar | None]:
     """Like `gradient_and_work`, but with a separate correction for each summand.
 
@@ -76,6 +77,6 @@ def gradient_and_work_by_rows(
     for fn in fixed:
         rows = RowPattern(fn, qa, small=0)
         gradients = lambda q, fn=fn, rows=rows: rows.derivative(fn, q)
-        by_row = derivative.gradients_of_rows(fn, gradients, rows.own, qa, qb)
+        by_row = derivative.gradients_of_rows(fn, gradients, rows.own, qa, qb, weights)
         total = total.at[rows.columns].add(by_row)
     return total, work

@@ -288,10 +288,14 @@ class SeparableModel(AbstractModel):
         with_time = None if self.system.driven is None else driven_action
         ends, none = ((a.q, a.t), (b.q, b.t)), jnp.zeros((0,), h.dtype)
         energies = self._element_energies(a.q)
+        # In this metric a correction gives all coordinates accelerations along the step: a
+        # heavy body does not drive a light one.
+        has_correction = not isinstance(derivative, ChainRule)
+        weights = self._masses(0.5 * (a.q + b.q)) if has_correction else jnp.ones_like(a.q)
         if energies is None or not isinstance(derivative, AbstractCorrected):
             size = self.action_size(derivative, a, h, increment)
             impulse, work = gradient_and_work(
-                derivative, action, with_time, *ends, size=size
+                derivative, action, with_time, *ends, weights, size
             )
             impulse = self.nonholonomic_impulse(impulse, a, b, nonholonomic)
             return Gradient(impulse, none, work, torque)
@@ -303,7 +307,9 @@ class SeparableModel(AbstractModel):
         if self.has_slip_rate(nonholonomic):
             eta = nonholonomic.velocity_impulse
             rows += [lambda q: h * eta * (self.nonholonomic(q) @ mean_rate(q))]
-        impulse, work = gradient_and_work_by_rows(derivative, rows, with_time, *ends)
+        impulse, work = gradient_and_work_by_rows(
+            derivative, rows, with_time, *ends, weights
+        )
         if self.has_linear_potential:
             impulse = impulse + h * jax.grad(self._potential)(a.q)
         impulse = self.nonholonomic_impulse(impulse, a, b, nonholonomic)
@@ -411,8 +417,12 @@ class SeparableModel(AbstractModel):
         kind, relations = self.kinematics, self.coordinate
         return kind.step_scale(state.q, self.inertia, relations, self.args)
 
-    def coordinate_scale(self, step: Increments) -> Coordinates:
-        return self.kinematics.coordinate_scale(step)
+    def coordinate_scale(self, state: State, step: Increments) -> Coordinates:
+        return jnp.sqrt(self._masses(state.q))
+
+    def _masses(self, q: Coordinates) -> Coordinates:
+        """The inertia of each coordinate."""
+        return self.kinematics.masses(q, self.inertia, self.coordinate, self.args)
 
     def stiffness(
         self, state: State, multipliers: Multipliers

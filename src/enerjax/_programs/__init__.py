@@ -27,6 +27,7 @@ from .jaxprs import (
     programs_within as programs_within,
     wrapped_program as wrapped_program,
 )
+from .known_indices import computed_indices as computed_indices, is_index as is_index
 from .machine_code import (
     in_one_function as in_one_function,
     part as part,

@@ -40,16 +40,17 @@ def computed_indices(
     `None` too if an output has more than `most` numbers.
     """
     avals = [x.aval for x in equation.outvars]
-    if any(not _is_index(x) or x.size > most for x in avals):
+    if any(not is_index(x) or x.size > most for x in avals):
         return None
     known = [known_numbers(x) for x in values]
     # NumPy rounds numbers to indices in another way than XLA.
-    if equation.effects or any(x is None or not _is_index(x) for x in known):
+    if equation.effects or any(x is None or not is_index(x) for x in known):
         return None
     with jax.ensure_compile_time_eval():
         out = evaluated(equation.primitive, known, equation.params)
     return [np.asarray(x, aval.dtype) for x, aval in zip(out, avals, strict=True)]
 
 
-def _is_index(x: Any) -> bool:
+def is_index(x: Any) -> bool:
+    """Whether the entries of an array are indices or truth values."""
     return getattr(x.dtype, "kind", "key") in "iub"

@@ -174,8 +174,10 @@ class AbstractKinematics(eqx.Module):
         """The scales of the increments."""
 
     @abc.abstractmethod
-    def coordinate_scale(self, step: Increments) -> Coordinates:
-        """The scales of the coordinates, given those of the increments."""
+    def masses(
+        self, q: Coordinates, inertia: Symmetric, relations: Relations, args: Args
+    ) -> Coordinates:
+        """The inertia of each coordinate, which is positive."""
 
     @abc.abstractmethod
     def frames(
@@ -296,9 +298,6 @@ class AbstractFlatKinematics(AbstractKinematics):
 
     def inertia(self, of_user, energy, dtype):
         return of_user()
-
-    def coordinate_scale(self, step):
-        return step
 
     def mean_rates(self, a, b, lift, by_rates):
         mean = 0.5 * (a.v + b.v)

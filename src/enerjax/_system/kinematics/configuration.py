@@ -76,7 +76,10 @@ class ConfigurationKinematics(AbstractAddedKinematics):
         return jnp.sqrt(inertia.diagonal())
 
     def step_scale(self, q, inertia, relations, args):
-        return jnp.sqrt(self.metric(q, inertia, relations, args).diagonal())
+        return jnp.sqrt(self.masses(q, inertia, relations, args))
+
+    def masses(self, q, inertia, relations, args):
+        return self.metric(q, inertia, relations, args).diagonal()
 
     def frames(self, q, jacobian, args):
         matrix = jnp.concatenate([self.matrix(q, args), jacobian(q)])

@@ -68,6 +68,9 @@ class AbstractIndependentKinematics(AbstractPlainKinematics):
     def velocity_scale(self, inertia):
         return jnp.sqrt(inertia.diagonal())
 
+    def masses(self, q, inertia, relations, args):
+        return inertia.diagonal()
+
 
 class IdentityKinematics(AbstractIndependentKinematics, AbstractAddedKinematics):
     """Point masses, minimal coordinates with constant inertia."""

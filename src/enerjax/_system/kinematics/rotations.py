@@ -124,13 +124,13 @@ class RigidKinematics(AbstractKinematics):
     def step_scale(self, q, inertia, relations, args):
         return self.velocity_scale(inertia)
 
-    def coordinate_scale(self, step):
-        # That of a director is the root of the polar moment, the sum of second moments.
-        bodies = self.bodies
-        moved, turned = bodies.vectors(step)
-        polar = jnp.sqrt(0.5 * dot(turned, turned))
+    def masses(self, q, inertia, relations, args):
+        # That of a director is the polar moment, the sum of second moments.
+        bodies, masses = self.bodies, inertia.diagonal()
+        moved, turned = bodies.vectors(masses)
+        polar = 0.5 * jnp.sum(turned, axis=0)
         axes = jnp.broadcast_to(polar, (3, 3, polar.size))
-        return bodies.coordinates((moved, axes), bodies.other_rates(step))
+        return bodies.coordinates((moved, axes), bodies.other_rates(masses))
 
     def frames(self, q, jacobian, args):
         return None
