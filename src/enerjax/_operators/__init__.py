@@ -11,7 +11,7 @@ from .scaling import (
     scales_like as scales_like,
     shortened as shortened,
 )
-from .separable import SeparableModel as SeparableModel
+from .separable import FEW_FREE as FEW_FREE, SeparableModel as SeparableModel
 from .strains import Strains as Strains
 
 

@@ -130,17 +130,18 @@ class DelassusMatrix(eqx.Module):
     def elastic_rates(self, velocity: Velocities) -> Float[Array, " n"]:
         """`S velocity`, behind zeros for the joints."""
         assert self.elastic is not None
-        assert self.schur is not None
-        num_joints = self.schur.tables.num_rows
-        return self.elastic.product(velocity).at[:num_joints].set(0)
+        return self.elastic.product(velocity).at[: self._num_joints].set(0)
 
     @property
     def is_strain(self) -> Bool[np.ndarray, " n"]:
         """Which rows of `S`, behind those of the joints, are those of strains."""
         assert self.elastic is not None
-        assert self.schur is not None
         rows = np.arange(self.elastic.tables.num_rows)
-        return rows < self.schur.tables.num_rows + self.num_strains
+        return rows < self._num_joints + self.num_strains
+
+    @property
+    def _num_joints(self) -> int:
+        return 0 if self.schur is None else self.schur.tables.num_rows
 
     def _beside_strains(
         self, elastic: Schur, right: Float[Array, "k n"], free: Float[Array, "k nv"]

@@ -56,20 +56,25 @@ class ElasticTables(NamedTuple):
 
     The colours of the columns are equal, so one set of products serves both.
 
+    - `joints`: `None` if there are none.
     - `terms`: which rows there are behind those of the joints.
     - `num_strains`: the number of the rows of strains; those of dampers follow.
     """
 
-    joints: SchurTables
+    joints: SchurTables | None
     both: SchurTables
     terms: ChordTerms
     num_strains: int
 
     @property
     def description(self) -> str:
-        count = self.both.num_rows - self.joints.num_rows
+        count = self.both.num_rows - self._num_joints
         what = " and ".join(self.terms)
         return f"{self.both.description}; {count} of the rows are those of {what}"
+
+    @property
+    def _num_joints(self) -> int:
+        return 0 if self.joints is None else self.joints.num_rows
 
     def schurs(
         self,
@@ -77,27 +82,28 @@ class ElasticTables(NamedTuple):
         rest: Velocities,
         weight: Symmetric,
         added: JointMultipliers | None,
-    ) -> tuple[Schur, Schur]:
+    ) -> tuple[Schur | None, Schur]:
         """The factors without and with strains; `added` is the regularisation of joints."""
-        products = self.both.products(rates, rest)
-        num_joints = self.joints.num_rows
+        products, num_joints = self.both.products(rates, rest), self._num_joints
         ones = jnp.ones((self.both.num_rows - num_joints,), rest.dtype)
         of_joints = jnp.zeros((num_joints,), rest.dtype) if added is None else added
         diagonal = jnp.concatenate([of_joints, ones])
-        return (
-            schur(self.joints, products[:num_joints], weight, added),
-            schur(self.both, products, weight, diagonal),
-        )
+        both = schur(self.both, products, weight, diagonal)
+        if self.joints is None:
+            return None, both
+        return schur(self.joints, products[:num_joints], weight, added), both
 
 
 def elastic_tables(
     rates: Rates, num_joints: int, rest: Velocities, weight: Symmetric
-) -> tuple[SchurTables, SchurTables] | None:
+) -> tuple[SchurTables | None, SchurTables] | None:
     """The tables of the joints, and of all `rates`; `None` where the elimination is long,
     like that of a net."""
     both = schur_tables(rates, rest, weight, bounds=_BOUNDS)
     if both is None:
         return None
+    if num_joints == 0:
+        return None, both
     joints = schur_tables(lambda v: rates(v)[:num_joints], rest, weight, both.colours)
     return None if joints is None else (joints, both)
 

@@ -6,6 +6,7 @@ guesses are the unknowns of a free flight, which is a step without forces, plus 
 extrapolation of the differences between the last steps and their free flights.
 """
 
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -363,19 +364,21 @@ def _with_multipliers(
     return jax.tree.map(change, z, *others, is_leaf=_is_increment)
 
 
-def owners_of(z: PyTree[Any], num_joints: int) -> tuple[int | None, ...] | None:
+def owners_of(z: PyTree[Any], num_joints: int) -> tuple[int | None, ...]:
     """The number of the coordinate that each unknown belongs to, or `-1 - k` for a
     multiplier of row `k`. Those of relations between coordinates, the rows behind those of
     joints, have none: without its relation the inertia of a quaternion is singular, and
     they go with the coordinates that they relate.
 
-    The whole is `None` if there are other unknowns than those of increments.
+    Unknowns outside of increments, such as the impulses of strains, are like coordinates:
+    their own rows determine them.
     """
-    increments = jax.tree.leaves(z, is_leaf=_is_increment)
-    if not all(map(_is_increment, increments)):
-        return None
     owners: list[int | None] = []
-    for x in increments:
+    following = itertools.count(2 * sum(x.size for x in jax.tree.leaves(z)))
+    for x in jax.tree.leaves(z, is_leaf=_is_increment):
+        if not _is_increment(x):
+            owners += itertools.islice(following, x.size)
+            continue
         size, num_momenta = x.rate.size, x.momentum.size
         first = 0 if num_momenta == size else size
         owners += (-1 - k if k < num_joints else None for k in range(x.impulse.size))

@@ -10,7 +10,7 @@ all later runs of the system.
 import jax
 import jax.numpy as jnp
 
-from .._operators import SeparableModel
+from .._operators import FEW_FREE, SeparableModel
 from .._programs import (
     call_traced_once,
     compiled_for_once,
@@ -53,7 +53,7 @@ def chord_alone(task: Task, experience: Experience) -> ChordAlone | None:
         return None
     is_separable = isinstance(system, System)
     has_joints = system.constraint is not None or system.driven is not None
-    if not has_joints and is_separable:
+    if not has_joints and is_separable and task.start.v.size <= FEW_FREE:
         return None
     # The inertia of an arm is ill-conditioned: single precision leaves too few digits.
     if not is_separable and task.start.q.dtype == jnp.float32:
