@@ -55,6 +55,11 @@ def test_numbers_that_vary_over_devices_are_refused():
     assert many(False)(jnp.ones(1)).shape[0] == 1
 
 
+def test_masses_in_place_of_an_inertia_matrix_are_refused():
+    with pytest.raises(ValueError, match="jnp.diag"):
+        ej.System(jnp.ones(60), lambda q, args: 0.5 * q @ q)
+
+
 def test_the_step_checks_its_input_too():
     system = ej.System(kinetic, potential, rod)
     with pytest.raises(ValueError, match="positive"):

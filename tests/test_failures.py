@@ -1,5 +1,7 @@
 """Failures are values: they are reported where they happen, and earlier rows stay valid."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -335,3 +337,14 @@ def test_a_negative_mass_fails_under_jit_too():
     ).result)  # fmt: skip
     assert run(1.0) == ej.RESULTS.successful
     assert run(-1.0) == ej.RESULTS.invalid_energy
+
+
+def test_steps_and_times_that_are_not_positive_fail_under_vmap():
+    system = ej.System(jnp.eye(1), lambda q, args: 0.5 * q @ q)
+    start = ej.State(jnp.ones(1), jnp.zeros(1))
+    run = functools.partial(ej.simulate, system, ej.EnergyPreserving(), start, throw=False)
+    fails = lambda sol: sol.result == ej.RESULTS.invalid_step
+    by_step = jax.vmap(lambda h: fails(run(h=h, num_steps=3)))
+    assert by_step(jnp.array([0.1, -0.1, 0.0, jnp.nan])).tolist() == [False, *[True] * 3]
+    by_time = jax.vmap(lambda t1: fails(run(h=0.1, t1=t1, max_steps=20)))
+    assert by_time(jnp.array([1.0, -0.5])).tolist() == [False, True]

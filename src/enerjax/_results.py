@@ -88,6 +88,10 @@ class RESULTS(eqx.Enumeration):
         "not that of the `rigid_bodies`. The same call outside of `jit` and `vmap` says "
         "what is wrong."
     )
+    invalid_step = (
+        "The step `h`, or the time from `t0` to `t1`, is not positive and finite. Outside "
+        "of `jit` and `vmap` such a call raises an error."
+    )
     angle_jumped = (
         "The angle of a torsion spring in space passed half a turn, where its energy is "
         "not smooth. Such an angle counts from the start pose, that of a spring in a file "
@@ -118,6 +122,7 @@ _NAMES = (
     "inconsistent_reset",
     "restitution_out_of_range",
     "invalid_energy",
+    "invalid_step",
     "angle_jumped",
     "interrupted",
 )

@@ -68,8 +68,9 @@ class Solution(eqx.Module):
       what `SaveAt(fn=...)` made of the states.
     - `multipliers`: shape `(times, nc)`, `lambda` of the step that ends at each row: of
       joints, driven constraints, nonholonomic constraints and relations between
-      coordinates, in this order. Those of row 0 belong to the consistent start. The force
-      on the coordinates is `-B^T lambda`.
+      coordinates, in this order. They are means over the step: of order 2 in its middle
+      and of order 1 at the row, in schemes of higher order too. Those of row 0 belong to
+      the consistent start. The force on the coordinates is `-B^T lambda`.
     - `details`: what only this scheme reports, for the steps that end at the rows after
       the start (`KappaDecaying`: kappa, shape `(times - 1,)`), or `None`.
     - `audit`: energies and constraint residuals.

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from .._operators import AbstractModel
-from .._results import RESULTS
+from .._results import first_failure, RESULTS
 from .._solvers import ChordAlone, RootFinder
 from .._system import AbstractSystem, has_valid_energy, State
 from .._types import Args, Coordinates, Scalar
@@ -65,13 +65,19 @@ class Task(NamedTuple):
             root_finder=self.root_finder,
             max_halvings=self.max_halvings,
             watcher=self.watcher,
-            checked=RESULTS.successful if self.is_checked else self._checked(),
+            checked=self._checked(),
         )
 
     def _checked(self) -> RESULTS:
-        """The outcome of checks in the program of a run whose numbers are traced."""
+        """The outcome of checks in the program of a run, whose numbers may be traced."""
+        unit = jax.lax.stop_gradient(self.plan.unit)
+        goes_on = (unit > 0) & jnp.isfinite(unit)
+        step = RESULTS.where(goes_on, RESULTS.successful, RESULTS.invalid_step)
+        if self.is_checked:
+            return step
         valid = has_valid_energy(self.system, self.start, self.args)
-        return RESULTS.where(valid, RESULTS.successful, RESULTS.invalid_energy)
+        energy = RESULTS.where(valid, RESULTS.successful, RESULTS.invalid_energy)
+        return first_failure(step, energy)
 
     @property
     def observes_in_loop(self) -> bool:

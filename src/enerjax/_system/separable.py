@@ -151,7 +151,13 @@ class System(AbstractSystem):
                     "`kinetic` must be a function of (v, args) or the real inertia matrix, "
                     f"got {kinetic!r}."
                 )
-            kinetic = in_blocks(inexact(kinetic))
+            kinetic = inexact(kinetic)
+            if kinetic.ndim != 2:
+                raise ValueError(
+                    f"The inertia matrix has shape {kinetic.shape}: give a square matrix. "
+                    "That of masses is `jnp.diag(masses)`."
+                )
+            kinetic = in_blocks(kinetic)
         self.kinetic = kinetic
         self.potential = potential
         self.constraint = constraint
