@@ -431,6 +431,37 @@ def test_updates_that_join_what_is_at_a_place(kind, places):
         np.testing.assert_array_equal(found, whole(x, jnp.array(4)))
 
 
+@pytest.mark.parametrize("mode", ["clip", "fill"])
+def test_rows_at_computed_places_whose_other_axis_has_a_place_too(mode):
+    """That is how JAX differentiates `x[k]` of an array, in a loop over `k`."""
+    modes = jax.lax.GatherScatterMode
+    how = dict(clip=modes.CLIP, fill=modes.FILL_OR_DROP)[mode]
+    dims = jax.lax.ScatterDimensionNumbers((0,), (0,), (0, 1))
+
+    def fn(x, row, place):
+        to = jnp.stack([place, jnp.zeros_like(place)])
+        added = jax.lax.scatter_add(x, to, row, dims, mode=how)
+        moved = jax.lax.scatter_add(x, to[::-1], row, dims, mode=how)
+        return added, moved
+
+    x, row = jnp.cos(jnp.arange(12.0)).reshape(4, 3), jnp.arange(1.0, 4.0)
+    assert not why_not_one_function(fn, x, row, jnp.array(2))
+    for place in (-1, 0, 2, 4):
+        found = jax.jit(in_one_function(fn))(x, row, jnp.array(place))
+        jax.tree.map(np.testing.assert_array_equal, found, fn(x, row, jnp.array(place)))
+
+
+def test_the_gradient_of_a_loop_over_rows_is_one_function():
+    def energy(x):
+        pair = lambda k, total: total + jnp.sum((x[k] - x[0]) ** 2) / (1 + x[k] @ x[k])
+        return jax.lax.fori_loop(0, len(x), pair, 0.0)
+
+    x = jnp.cos(jnp.arange(15.0)).reshape(5, 3)
+    assert not why_not_one_function(jax.grad(energy), x)
+    found = jax.jit(in_one_function(jax.grad(energy)))(x)
+    np.testing.assert_allclose(found, jax.grad(energy)(x), rtol=1e-14)
+
+
 def test_known_places_stay_known():
     """JAX counts negative places from the end, which many updates must not compute."""
     places = jnp.asarray(np.arange(150)[::-1])

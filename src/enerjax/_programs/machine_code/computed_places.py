@@ -354,7 +354,7 @@ def _scattered_to_computed(self: "Evaluation", eqn: Any, operand, index, updates
     axes = dims.scatter_dims_to_operand_dims
     whole = [covered.get(axis, 1) for axis in range(len(operand.shape))]
     is_row = all(n in (1, m) for n, m in zip(whole, operand.shape, strict=True))
-    if not is_row or any(whole[axis] != 1 for axis in axes) or dims.operand_batching_dims:
+    if not is_row or dims.operand_batching_dims:
         raise Unsupported("a scatter of windows to computed places")
     if count * size > 8 * MOST_CELLS:
         raise Unsupported("many updates of computed places")
@@ -365,12 +365,15 @@ def _scattered_to_computed(self: "Evaluation", eqn: Any, operand, index, updates
     )
     starts, of = self.cellar.unlaned(index).reshape(count, -1), dtype_of(index)
     clips = params["mode"] == jax.lax.GatherScatterMode.CLIP
+    # An update that covers an axis begins at its first place.
     coordinates, out = np.indices(operand.shape), operand
+    coordinates[[axis for axis, n in enumerate(whole) if n > 1]] = 0
     for k in range(count):
         numbers = [_whole_number(self, x, of) for x in starts[k].tolist()]
         if clips:
             pairs = zip(numbers, axes, strict=True)
-            numbers = [_clamped(self, x, operand.shape[axis] - 1) for x, axis in pairs]
+            room = np.array(operand.shape) - whole
+            numbers = [_clamped(self, x, int(room[axis])) for x, axis in pairs]
 
         def rule(old, new, *places, numbers=numbers):
             on: Number = True
