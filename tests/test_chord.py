@@ -849,3 +849,73 @@ def test_a_run_that_fails_in_both_ways_is_forgotten(searched_by):
 
     assert run(5.0) == ["ChordAlone", "Newton"]
     assert run(1e-3) == ["ChordAlone"]
+
+
+# Systems without constraints --------------------------------------------------------------
+
+
+def _free_masses(count, stiffness):
+    """Masses in a row, on springs whose tension is linear in the length or not."""
+
+    def potential(q, args):
+        change = jnp.diff(q)
+        squares = 0.5 * stiffness * jnp.sum(change**2)
+        return squares + jnp.sum(jnp.cosh(change)) + 0.1 * jnp.sum(q**4)
+
+    masses = jnp.diag(1.0 + jnp.arange(float(count)) % 3.0)
+    q = 0.3 * jnp.cos(jnp.arange(1.0, count + 1))
+    return ej.System(masses, potential), ej.State(q, q[::-1])
+
+
+FREE = [
+    ej.EnergyPreserving(),
+    ej.EnergyConsistent(0.0),
+    ej.EnergyDecaying(0.5),
+    ej.Composed(ej.EnergyPreserving(), 4),
+]
+
+
+@pytest.mark.parametrize("stiffness", [1.0, 1e4])
+@pytest.mark.parametrize("scheme", FREE, ids=str)
+def test_free_masses_move_as_with_newtons_method(scheme, stiffness):
+    system, start = _free_masses(12, stiffness)
+    run = functools.partial(ej.simulate, system, scheme, start, h=0.01, num_steps=50)
+    assert ej.explain(system, scheme, start).method.startswith("chord method")
+    found = run()
+    exact = run(root_finder=ej.Newton(linear_solver=lx.LU()))
+    # Round-off, which the stiff springs amplify.
+    np.testing.assert_allclose(found.ys.q, exact.ys.q, atol=1e-10)
+    scale = jnp.max(jnp.abs(found.audit.energy))
+    assert jnp.max(jnp.abs(found.audit.leak)) < 1e-13 * scale
+
+
+def test_few_coordinates_without_constraints_have_newtons_method_alone():
+    for count, has_chord in ((8, False), (9, True)):
+        system, start = _free_masses(count, 1.0)
+        method = ej.explain(system, ej.EnergyPreserving(), start).method
+        assert method.startswith("chord method") == has_chord
+
+
+def test_impulses_of_strains_are_eliminated_in_blocks():
+    """Of a truss with more bars than coordinates, which has no rows of strains."""
+    places = np.array([[x, y] for x in range(6) for y in range(2)], float)
+    ends = np.array([
+        (i, j)
+        for i in range(12)
+        for j in range(i)
+        if np.linalg.norm(places[i] - places[j]) < 1.5
+    ])  # fmt: skip
+    columns = np.concatenate([2 * ends[:, :1] + [0, 1], 2 * ends[:, 1:] + [0, 1]], axis=1)
+    rest = jnp.asarray(np.linalg.norm(places[ends[:, 0]] - places[ends[:, 1]], axis=1))
+    length = lambda x: jnp.sqrt(jnp.sum((x[:2] - x[2:]) ** 2))
+    bars = ej.Elements.from_strains(
+        lambda x, k, _: length(x) - rest[k], lambda k, _: 1e5, columns
+    )
+    system = ej.System(jnp.eye(24), bars)
+    start = ej.State(places.ravel(), 0.1 * np.sin(np.arange(24)))
+    scheme = ej.EnergyMomentumDecaying(0.5)
+    assert "blocks" in ej.explain(system, scheme, start, h=0.01).jacobian
+    run = functools.partial(ej.simulate, system, scheme, start, h=0.01, num_steps=20)
+    found, exact = run(), run(root_finder=ej.Newton(linear_solver=lx.LU()))
+    # Solver.
+    np.testing.assert_allclose(found.ys.q, exact.ys.q, atol=1e-10)

@@ -1,8 +1,8 @@
 """Discrete gradients that correct a mean gradient along the increment.
 
-Both forms are `g + c W d` with `d = b - a`, a mean gradient `g`, the weights `W` of the
-entries (in a step their inertia), and the scalar `c` that makes the
-directionality exact:
+Both forms are `g + c W d` with `d = b - a`, a mean gradient `g`, a metric `W` (in a step
+that of the inertia, otherwise one unless `weights` are given), and the scalar `c` that
+makes the directionality exact:
 
     c = (fn(b) - fn(a) - g . d) / (d . W d)
 
@@ -21,6 +21,7 @@ numerator is round-off at any `d`.
 import abc
 import functools
 from collections.abc import Callable, Iterable
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -32,17 +33,21 @@ from .._types import Coordinates, Scalar
 from .base import AbstractDerivative, significant
 
 
+# The diagonal of the metric of a correction, or its product with an increment.
+Weights: TypeAlias = Coordinates | float | Callable[[Coordinates], Coordinates]
+
+
 def _corrected(
     fn_a: Scalar,
     fn_b: Scalar,
     a: Coordinates,
     b: Coordinates,
     mean: Coordinates,
-    weights: Coordinates | float,
+    weights: Weights,
     size: Scalar | float,
 ) -> Coordinates:
     d = b - a
-    along = weights * d
+    along = weights(d) if callable(weights) else weights * d
     defect = fn_b - fn_a - mean @ d
     terms = abs(fn_a) + abs(fn_b) + abs(mean) @ (abs(a) + abs(b))
     defect = significant(defect, size + terms)
@@ -78,7 +83,7 @@ class AbstractCorrected(AbstractDerivative):
         a: Coordinates,
         b: Coordinates,
         *,
-        weights: Coordinates | float = 1.0,
+        weights: Weights = 1.0,
         size: Scalar | float = 0.0,
     ) -> Coordinates:
         mean = self._mean(jax.grad(fn), a, b)

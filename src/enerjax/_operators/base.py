@@ -544,7 +544,7 @@ class AbstractModel(eqx.Module):
         """
         q = state.q
         step = self.step_scale(state)
-        coordinate = self.coordinate_scale(state, step)
+        coordinate = self.coordinate_scale(step)
         constraint, size = row_scales(self.constraint_near(q, state.t), q, coordinate)
         if self.system.nonholonomic is not None:
             # They have no terms in the position.
@@ -561,7 +561,7 @@ class AbstractModel(eqx.Module):
         """The scales of the rates of an increment."""
 
     @abc.abstractmethod
-    def coordinate_scale(self, state: State, step: Increments) -> Coordinates:
+    def coordinate_scale(self, step: Increments) -> Coordinates:
         """The scales of the coordinates, given those of the rates of an increment."""
 
 

@@ -137,7 +137,7 @@ class CanonicalModel(AbstractModel):
     def rates(self, q: Coordinates, v: Velocities) -> Coordinates:
         return self.lift(q, v)
 
-    def coordinate_scale(self, state: State, step: Coordinates) -> Coordinates:
+    def coordinate_scale(self, step: Coordinates) -> Coordinates:
         return step
 
     def push(self, qa: Coordinates, qb: Coordinates, rate: Coordinates) -> Velocities:

@@ -62,11 +62,12 @@ def gradient_and_work_by_rows(
     driven: Callable[[Coordinates, Time], Scalar] | None,
     a: tuple[Coordinates, Time],
     b: tuple[Coordinates, Time],
-    weights: Coordinates,
+    masses: Coordinates,
 ) -> tuple[Coordinates, Scalar | None]:
     """Like `gradient_and_work`, but with a separate correction for each summand.
 
     A single correction along the whole increment would couple all bodies with each other.
+    The metric of each is that of the `masses` of the coordinates.
     """
     (qa, ta), (qb, tb) = a, b
     total, work = jnp.zeros_like(qa), None
@@ -77,6 +78,6 @@ def gradient_and_work_by_rows(
     for fn in fixed:
         rows = RowPattern(fn, qa, small=0)
         gradients = lambda q, fn=fn, rows=rows: rows.derivative(fn, q)
-        by_row = derivative.gradients_of_rows(fn, gradients, rows.own, qa, qb, weights)
+        by_row = derivative.gradients_of_rows(fn, gradients, rows.own, qa, qb, masses)
         total = total.at[rows.columns].add(by_row)
     return total, work

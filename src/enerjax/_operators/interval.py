@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -106,7 +106,7 @@ def gradient_and_work(
     driven: Callable[[Coordinates, Time], Scalar] | None,
     a: tuple[Coordinates, Time],
     b: tuple[Coordinates, Time],
-    weights: Coordinates | float = 1.0,
+    weights: Any = 1.0,
     size: Scalar | float = 0.0,
 ) -> tuple[Coordinates, Scalar | None]:
     """The discrete gradient of `fixed(x) + driven(x, t)`, and its component for `t`.
@@ -118,7 +118,8 @@ def gradient_and_work(
     The correction of a corrected discrete derivative is added to `Dt` alone. There it is
     bounded even if `x` does not change, and only `Dt` contains the work of the driven
     constraints. `fixed` has a discrete gradient of its own, because its correction would
-    otherwise be counted as work of the driven constraints.
+    otherwise be counted as work of the driven constraints. `weights` are those that the
+    `gradient` of this derivative takes.
     """
     (xa, ta), (xb, tb) = a, b
     gradient = functools.partial(derivative.gradient, weights=weights, size=size)

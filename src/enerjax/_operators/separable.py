@@ -295,10 +295,12 @@ class SeparableModel(AbstractModel):
         with_time = None if self.system.driven is None else driven_action
         ends, none = ((a.q, a.t), (b.q, b.t)), jnp.zeros((0,), h.dtype)
         energies = self._element_energies(a.q)
-        # In this metric a correction gives all coordinates accelerations along the step: a
-        # heavy body does not drive a light one.
-        has_correction = not isinstance(derivative, ChainRule)
-        weights = self._masses(0.5 * (a.q + b.q)) if has_correction else jnp.ones_like(a.q)
+        # In the metric of the inertia a correction accelerates all bodies along their own
+        # steps, so a heavy body does not drive a light one.
+        weights = 1.0
+        if isinstance(derivative, AbstractCorrected):
+            middle, kind = 0.5 * (a.q + b.q), self.kinematics
+            weights = lambda d: kind.by_inertia(middle, d, self.inertia, self.args)
         if energies is None or not isinstance(derivative, AbstractCorrected):
             size = self.action_size(derivative, a, h, increment)
             impulse, work = gradient_and_work(
@@ -314,8 +316,10 @@ class SeparableModel(AbstractModel):
         if self.has_slip_rate(nonholonomic):
             eta = nonholonomic.velocity_impulse
             rows += [lambda q: h * eta * (self.nonholonomic(q) @ mean_rate(q))]
+        scales = self.kinematics.velocity_scale(self.inertia)
+        masses = scales**2 if scales.size == a.q.size else jnp.ones_like(a.q)
         impulse, work = gradient_and_work_by_rows(
-            derivative, rows, with_time, *ends, weights
+            derivative, rows, with_time, *ends, masses
         )
         if self.has_linear_potential:
             impulse = impulse + h * jax.grad(self._potential)(a.q)
@@ -424,12 +428,8 @@ class SeparableModel(AbstractModel):
         kind, relations = self.kinematics, self.coordinate
         return kind.step_scale(state.q, self.inertia, relations, self.args)
 
-    def coordinate_scale(self, state: State, step: Increments) -> Coordinates:
-        return jnp.sqrt(self._masses(state.q))
-
-    def _masses(self, q: Coordinates) -> Coordinates:
-        """The inertia of each coordinate."""
-        return self.kinematics.masses(q, self.inertia, self.coordinate, self.args)
+    def coordinate_scale(self, step: Increments) -> Coordinates:
+        return self.kinematics.coordinate_scale(step)
 
     def stiffness(
         self, state: State, multipliers: Multipliers

@@ -370,10 +370,11 @@ def owners_of(z: PyTree[Any], num_joints: int) -> tuple[int | None, ...]:
     joints, have none: without its relation the inertia of a quaternion is singular, and
     they go with the coordinates that they relate.
 
-    Unknowns outside of increments, such as the impulses of strains, are like coordinates:
-    their own rows determine them.
+    Unknowns outside of increments, the impulses of strains, have numbers of their own, as
+    coordinates have: the row of each contains the impulse itself, so its pivot is regular.
     """
     owners: list[int | None] = []
+    # Behind the numbers of all coordinates and momenta.
     following = itertools.count(2 * sum(x.size for x in jax.tree.leaves(z)))
     for x in jax.tree.leaves(z, is_leaf=_is_increment):
         if not _is_increment(x):

@@ -219,7 +219,7 @@ def check_values(system: AbstractSystem, state: State, args: Args) -> bool:
     violated = [
         name for name, ok in zip(_CONDITIONS, np.asarray(facts), strict=True) if not ok
     ]
-    # Only schemes that move no bodies by rotations refuse flat bodies.
+    # A flat body is refused by `check_without_rotations` alone.
     if set(violated) <= {"regular"}:
         return True
     functions = {role: describe(role, fn) for role, fn, _ in energies(system, state, args)}

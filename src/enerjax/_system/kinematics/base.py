@@ -174,10 +174,15 @@ class AbstractKinematics(eqx.Module):
         """The scales of the increments."""
 
     @abc.abstractmethod
-    def masses(
-        self, q: Coordinates, inertia: Symmetric, relations: Relations, args: Args
+    def coordinate_scale(self, step: Increments) -> Coordinates:
+        """The scales of the coordinates, given those of the increments."""
+
+    @abc.abstractmethod
+    def by_inertia(
+        self, q: Coordinates, change: Coordinates, inertia: Symmetric, args: Args
     ) -> Coordinates:
-        """The inertia of each coordinate, which is positive."""
+        """`W change`, where `change . W change / 2` is the kinetic energy of the motion at
+        `q` whose coordinates have these rates."""
 
     @abc.abstractmethod
     def frames(
@@ -298,6 +303,9 @@ class AbstractFlatKinematics(AbstractKinematics):
 
     def inertia(self, of_user, energy, dtype):
         return of_user()
+
+    def coordinate_scale(self, step):
+        return step
 
     def mean_rates(self, a, b, lift, by_rates):
         mean = 0.5 * (a.v + b.v)

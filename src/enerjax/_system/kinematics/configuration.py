@@ -76,10 +76,7 @@ class ConfigurationKinematics(AbstractAddedKinematics):
         return jnp.sqrt(inertia.diagonal())
 
     def step_scale(self, q, inertia, relations, args):
-        return jnp.sqrt(self.masses(q, inertia, relations, args))
-
-    def masses(self, q, inertia, relations, args):
-        return self.metric(q, inertia, relations, args).diagonal()
+        return jnp.sqrt(self.metric(q, inertia, relations, args).diagonal())
 
     def frames(self, q, jacobian, args):
         matrix = jnp.concatenate([self.matrix(q, args), jacobian(q)])
@@ -103,6 +100,9 @@ class ConfigurationKinematics(AbstractAddedKinematics):
             return momentum @ self.matrix(q, args)
         _, pull = jax.vjp(lambda step: self._push(q, step, args), jnp.zeros_like(q))
         return pull(momentum)[0]
+
+    def by_inertia(self, q, change, inertia, args):
+        return self.momentum_rows(q, inertia @ self._push(q, change, args), args)
 
     def momentum_change(self, qa, qb, change, mean, step, args):
         middle = 0.5 * (qa + qb)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ..._programs import Indices
 from ..._solvers import hessian, is_positive_definite, Symmetric
-from ..._types import Coordinates, Flag, Scalar, Velocities
+from ..._types import Flag, Scalar, Velocities
 from .base import AbstractAddedKinematics
 from .plain import AbstractPlainKinematics
 from .rigid_bodies import RigidBodies
@@ -65,19 +65,13 @@ class DirectorKinematics(AbstractPlainKinematics, AbstractAddedKinematics):
         return hessian(energy, jnp.zeros_like(q), together)
 
     def velocity_scale(self, inertia):
-        return jnp.sqrt(self._masses(inertia))
-
-    def masses(self, q, inertia, relations, args):
-        return self._masses(inertia)
-
-    def _masses(self, inertia: Symmetric) -> Coordinates:
         # An axis without inertia, as a flat body has, moves with the other axes.
         masses = inertia.diagonal()
         axes = _bodies(self.table, masses.size).q[:, 3:]
         together = np.repeat(np.arange(masses.size)[:, None], axes.shape[1], axis=1)
         together[axes] = axes[:, None]
         mean = jnp.mean(masses[together], axis=1)
-        return jnp.maximum(masses, 1e-3 * mean)
+        return jnp.sqrt(jnp.maximum(masses, 1e-3 * mean))
 
     def _second_moments(
         self, inertia: Symmetric

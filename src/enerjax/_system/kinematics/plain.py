@@ -43,6 +43,9 @@ class AbstractPlainKinematics(AbstractFlatKinematics):
     def momentum_rows(self, q, momentum, args):
         return momentum
 
+    def by_inertia(self, q, change, inertia, args):
+        return inertia @ change
+
     def momentum_change(self, qa, qb, change, mean, step, args):
         return change
 
@@ -67,9 +70,6 @@ class AbstractIndependentKinematics(AbstractPlainKinematics):
 
     def velocity_scale(self, inertia):
         return jnp.sqrt(inertia.diagonal())
-
-    def masses(self, q, inertia, relations, args):
-        return inertia.diagonal()
 
 
 class IdentityKinematics(AbstractIndependentKinematics, AbstractAddedKinematics):

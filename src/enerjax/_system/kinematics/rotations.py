@@ -124,13 +124,28 @@ class RigidKinematics(AbstractKinematics):
     def step_scale(self, q, inertia, relations, args):
         return self.velocity_scale(inertia)
 
-    def masses(self, q, inertia, relations, args):
-        # That of a director is the polar moment, the sum of second moments.
-        bodies, masses = self.bodies, inertia.diagonal()
-        moved, turned = bodies.vectors(masses)
-        polar = 0.5 * jnp.sum(turned, axis=0)
+    def coordinate_scale(self, step):
+        # That of a director is the root of the polar moment, the sum of second moments.
+        bodies = self.bodies
+        moved, turned = bodies.vectors(step)
+        polar = jnp.sqrt(0.5 * dot(turned, turned))
         axes = jnp.broadcast_to(polar, (3, 3, polar.size))
-        return bodies.coordinates((moved, axes), bodies.other_rates(masses))
+        return bodies.coordinates((moved, axes), bodies.other_rates(step))
+
+    def by_inertia(self, q, change, inertia, args):
+        # That of the directors `d_j` is the sum of `E_jk d_j . d_k / 2` with the second
+        # moments `E = tr(J)/2 - J`.
+        bodies, (moved, axes) = self.bodies, self.bodies.pose(change)
+        none, others = jnp.zeros_like(moved), bodies.others(change)
+        momentum = inertia @ bodies.velocities(moved, none, others)
+        turns = [none.at[k].set(1) for k in range(3)]
+        of_turn = lambda x: inertia @ bodies.velocities(none, x, jnp.zeros_like(others))
+        moments = jnp.stack([bodies.vectors(of_turn(x))[1] for x in turns])
+        polar = 0.5 * jnp.trace(moments)[None, None]
+        second = jnp.eye(3, dtype=change.dtype)[:, :, None] * polar - moments
+        turned = jnp.sum(second[:, :, None] * axes[None], axis=1)
+        pose = bodies.vectors(momentum)[0], turned
+        return bodies.coordinates(pose, bodies.other_rates(momentum))
 
     def frames(self, q, jacobian, args):
         return None
