@@ -284,7 +284,8 @@ def test_a_heavy_oscillator_does_not_turn_a_light_body(kind):
         axes = np.eye(3)
         rates = np.cross([0.0, 0.0, 2.0], axes)
         poses = [np.zeros(3), axes.ravel(), [1.0]], [np.zeros(3), rates.ravel(), [1.0]]
-        start = ej.State(*map(np.concatenate, poses))
+        q, v = map(np.concatenate, poses)
+        start = ej.State(q, v)
         spin = lambda ys: 0.5 * (
             jnp.cross(ys.q[:, 3:6], ys.v[:, 3:6]) + jnp.cross(ys.q[:, 6:9], ys.v[:, 6:9])
         )[:, 2]  # fmt: skip

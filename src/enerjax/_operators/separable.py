@@ -13,6 +13,7 @@ for the velocities in closed form.
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -294,28 +295,15 @@ class SeparableModel(AbstractModel):
 
         with_time = None if self.system.driven is None else driven_action
         ends, none = ((a.q, a.t), (b.q, b.t)), jnp.zeros((0,), h.dtype)
-        energies = self._element_energies(a.q)
-        # In the metric of the inertia a correction accelerates all bodies along their own
-        # steps, so a heavy body does not drive a light one.
-        weights = 1.0
-        if isinstance(derivative, AbstractCorrected):
-            middle, kind = 0.5 * (a.q + b.q), self.kinematics
-            weights = lambda d: kind.by_inertia(middle, d, self.inertia, self.args)
-        if energies is None or not isinstance(derivative, AbstractCorrected):
+        rows = self._rows_of_action(a.q, h, fixed, nonholonomic, mean_rate)
+        if rows is None or not isinstance(derivative, AbstractCorrected):
+            weights = self._weights(derivative, 0.5 * (a.q + b.q))
             size = self.action_size(derivative, a, h, increment)
             impulse, work = gradient_and_work(
                 derivative, action, with_time, *ends, weights, size
             )
             impulse = self.nonholonomic_impulse(impulse, a, b, nonholonomic)
             return Gradient(impulse, none, work, torque)
-        rows: list[Summands] = [lambda q, fn=fn: h * fn(q) for fn in energies]
-        rows += [lambda q: fixed.impulse * self.all_fixed(q)]
-        if fixed.velocity_impulse.size > 0:
-            eta = fixed.velocity_impulse
-            rows += [lambda q: h * eta * jax.jvp(self.fixed, (q,), (mean_rate(q),))[1]]
-        if self.has_slip_rate(nonholonomic):
-            eta = nonholonomic.velocity_impulse
-            rows += [lambda q: h * eta * (self.nonholonomic(q) @ mean_rate(q))]
         scales = self.kinematics.velocity_scale(self.inertia)
         masses = scales**2 if scales.size == a.q.size else jnp.ones_like(a.q)
         impulse, work = gradient_and_work_by_rows(
@@ -325,6 +313,41 @@ class SeparableModel(AbstractModel):
             impulse = impulse + h * jax.grad(self._potential)(a.q)
         impulse = self.nonholonomic_impulse(impulse, a, b, nonholonomic)
         return Gradient(impulse, none, work, torque)
+
+    def _weights(self, derivative: AbstractDerivative, q: Coordinates) -> Any:
+        """The metric of a correction: that of the inertia at `q`.
+
+        In this metric a correction accelerates all bodies along their own steps, so a heavy
+        body does not drive a light one.
+        """
+        if not isinstance(derivative, AbstractCorrected):
+            return 1.0
+        return lambda d: self.kinematics.by_inertia(q, d, self.inertia, self.args)
+
+    def _rows_of_action(
+        self,
+        q: Coordinates,
+        h: Scalar,
+        fixed: Increment,
+        nonholonomic: Increment,
+        mean_rate: Callable[[Coordinates], Coordinates],
+    ) -> list[Summands] | None:
+        """The action as a sum of rows that depend on few coordinates each.
+
+        `None` where the summands of the potential are unknown; see `elements.py`.
+        """
+        energies = self._element_energies(q)
+        if energies is None:
+            return None
+        rows: list[Summands] = [lambda q, fn=fn: h * fn(q) for fn in energies]
+        rows += [lambda q: fixed.impulse * self.all_fixed(q)]
+        if fixed.velocity_impulse.size > 0:
+            eta = fixed.velocity_impulse
+            rows += [lambda q: h * eta * jax.jvp(self.fixed, (q,), (mean_rate(q),))[1]]
+        if self.has_slip_rate(nonholonomic):
+            slip = nonholonomic.velocity_impulse
+            rows += [lambda q: h * slip * (self.nonholonomic(q) @ mean_rate(q))]
+        return rows
 
     def structure(
         self, a: State, b: State, h: Scalar, rate: Increments, gradient: Gradient
