@@ -4,6 +4,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from .._programs import call_traced_once
 from .._solvers import BlockDiagonal, hessian, in_blocks, Symmetric
@@ -151,13 +152,7 @@ class System(AbstractSystem):
                     "`kinetic` must be a function of (v, args) or the real inertia matrix, "
                     f"got {kinetic!r}."
                 )
-            kinetic = inexact(kinetic)
-            if kinetic.ndim != 2:
-                raise ValueError(
-                    f"The inertia matrix has shape {kinetic.shape}: give a square matrix. "
-                    "That of masses is `jnp.diag(masses)`."
-                )
-            kinetic = in_blocks(kinetic)
+            kinetic = _in_blocks(inexact(kinetic))
         self.kinetic = kinetic
         self.potential = potential
         self.constraint = constraint
@@ -297,3 +292,12 @@ class System(AbstractSystem):
             names=names,
             events=tuple(events),
         )
+
+
+def _in_blocks(inertia: Array) -> Symmetric:
+    if inertia.ndim != 2:
+        raise ValueError(
+            f"The inertia matrix has shape {inertia.shape}: give a square matrix. That of "
+            "masses is `jnp.diag(masses)`."
+        )
+    return in_blocks(inertia)
