@@ -115,8 +115,8 @@ class Walk:
     def _equation(self, equation: Any, values: list[Value]) -> list[Value]:
         primitive, params = equation.primitive, equation.params
         if not any(moves(value) for value in values):
-            # A trace makes numbers that are not known of those that it computes. Indices
-            # stay known: they tell which entries are angles.
+            # Under `jit` JAX would return traced numbers here, of known ones too. Indices
+            # stay known numbers, because they tell which entries are angles.
             indices = computed_indices(equation, values, _MANY)
             return evaluate(primitive, values, params) if indices is None else indices
         rule = self._rules.get(name_of(equation))

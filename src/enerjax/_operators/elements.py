@@ -35,10 +35,10 @@ _MOST_COLOURS = 24
 def element_energies(system: System, q: Coordinates, args: Args) -> list[Summands] | None:
     """The summands of the potential of a large system, or `None` if they are unknown.
 
-    Newton's method needs a sparse Jacobian. Of systems without constraints it has one of
-    the coordinates alone, so fewer of them are many there, and the summands of a plain
-    function are those of its program. Elsewhere the derivatives of these would cost more
-    than one correction for the whole potential, which the chord method omits.
+    Newton's method needs a sparse Jacobian, which one correction for the whole potential
+    would make dense. Without constraints the threshold is lower, and the summands of a plain
+    function are read off its program. With constraints their derivatives would cost more
+    than a correction for the whole potential, which the chord method omits.
     """
     potential = system.potential
     kinds = system.constraint, system.driven, system.nonholonomic
