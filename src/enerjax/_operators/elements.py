@@ -36,7 +36,7 @@ def element_energies(system: System, q: Coordinates, args: Args) -> list[Summand
     """The summands of the potential of a large system, or `None` if they are unknown.
 
     Newton's method needs a sparse Jacobian, which one correction for the whole potential
-    would make dense. Without constraints the threshold is lower, and the summands of a plain
+    would make dense. Without constraints the threshold is lower, and those of a plain
     function are read off its program. With constraints their derivatives would cost more
     than a correction for the whole potential, which the chord method omits.
     """
